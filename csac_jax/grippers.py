@@ -1,7 +1,4 @@
-"""A gripper as numbers: what planning, judging and drawing need of it, without its MJCF.
-
-    GRIPPER/gripper.json   the numbers, see `Gripper`; docs/grippers.md explains each
-    GRIPPER/gripper.xml    its MJCF, which only physics and pictures read
+"""A gripper as numbers, GRIPPER/gripper.json; only physics and pictures read its MJCF.
 
 Two pads face one another. They close along a straight line, or stay parallel and move on an arc, as
 a parallelogram of links moves them; then the tips come lower as they close.
@@ -56,11 +53,6 @@ class Fingers(NamedTuple):
         """Returns half the sides of the floor a finger needs, along the closing and across, m."""
         return 0.5 * self.thickness + _FINGER_ROOM, 0.5 * self.width + _FINGER_ROOM
 
-    @property
-    def finger_offset(self) -> Any:
-        """Returns the distance from the middle of the open hand to that of a finger, m."""
-        return 0.5 * self.opening + 0.5 * self.thickness
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Shared:
@@ -81,8 +73,7 @@ class _Shared:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gripper(_Shared):
-    """A two-finger gripper. Its tip frame lies between the open tips: z points back to the flange,
-    the fingers close along x."""
+    """A two-finger gripper. Tip frame: between the open tips, z to the flange, closing along x."""
 
     folder: Path
     actuator: str
@@ -117,10 +108,7 @@ class Gripper(_Shared):
 
     @property
     def angles(self) -> Ends:
-        """Returns the links' angles from straight ahead, rad.
-
-        Their arc has `arc_radius`; its chord leads from the closed pad to the open one.
-        """
+        """Returns the links' angles from straight ahead, rad; their arc has `arc_radius`."""
         assert self.arc_radius is not None
         across, back = self.half[1] - self.half[0], self.depth[0] - self.depth[1]
         middle = math.atan2(back, across)
@@ -150,7 +138,6 @@ class Gripper(_Shared):
         return self.arc_radius * (xp.cos(self._along(half, xp)) - math.cos(self.angles[1]))
 
     def _between(self, ends: Ends, half: Any, xp: Any) -> Any:
-        """Interpolates between `ends` in step with the pads' way."""
         low, high = self._way
         return ends[0] + (self._along(half, xp) - low) * ((ends[1] - ends[0]) / (high - low))
 
@@ -172,10 +159,9 @@ def shipped() -> list[str]:
 
 
 def load(source: "str | Gripper") -> Gripper:
-    """Returns the gripper of a name or a folder; a gripper is returned as it is.
+    """Returns the gripper of a name or a folder, which is read at each call; a gripper as it is.
 
-    A folder is read at each call: nothing of it is kept. Raises SettingsError for a source that is
-    no gripper, and for numbers that are missing, unknown or out of range.
+    Raises SettingsError for a source that is no gripper, and for numbers that are wrong.
     """
     if isinstance(source, Gripper):
         return source
@@ -183,8 +169,7 @@ def load(source: "str | Gripper") -> Gripper:
 
 
 def resolve(source: "str | Gripper") -> "str | Gripper":
-    """Replaces the folder of a gripper by the gripper, so that it is read once and travels with its
-    config; the name of a shipped one stays. Raises SettingsError as `load`."""
+    """Replaces the folder of a gripper by the gripper, so that it travels with its config."""
     return source if source in shipped() else load(source)
 
 
@@ -196,9 +181,8 @@ def _shipped(name: str) -> Gripper:
 def _from_folder(folder: Path) -> Gripper:
     path = folder / NUMBERS
     if not path.is_file():
-        known = ", ".join(shipped())
-        fault = f"'{folder}' is neither one of {known} nor a folder with a {NUMBERS}"
-        raise SettingsError(f"sim.gripper: {fault}")
+        neither = f"sim.gripper: '{folder}' is neither one of {', '.join(shipped())}"
+        raise SettingsError(f"{neither} nor a folder with a {NUMBERS}")
     if path.stat().st_size > LARGEST:
         raise SettingsError(f"{path}: is larger than 1 MiB")
     try:
@@ -208,8 +192,7 @@ def _from_folder(folder: Path) -> Gripper:
 
 
 def from_numbers(folder: Path, numbers: dict[str, Any]) -> Gripper:
-    """Builds a gripper from the content of a gripper.json; physics and pictures alone need the
-    folder. Raises ValueError for numbers that are missing, unknown or out of range."""
+    """Builds a gripper from the content of a gripper.json. Raises ValueError for wrong numbers."""
     return _from_json(folder, json.dumps(numbers))
 
 
@@ -269,7 +252,6 @@ def _adapter() -> Any:
 
 
 def _from_json(folder: Path, content: str | bytes) -> Gripper:
-    """Builds a gripper from JSON. Raises ValueError, one line that names the key."""
     try:
         numbers = _adapter().validate_json(content, strict=True)
     except ValueError as error:
@@ -292,7 +274,7 @@ def _from_json(folder: Path, content: str | bytes) -> Gripper:
 
 
 def _rules(gripper: Gripper) -> Iterator[tuple[str, Any]]:
-    """Yields what numbers must be, and True if they are; each may rely on those before it."""
+    """Yields what numbers must be, and if they are; each may rely on those before it."""
     half, depth, finger = gripper.half, gripper.depth, gripper.finger
     numbers = [*gripper.set_points, *sum(gripper.positions, ()), gripper.arc_radius or 0.0]
     yield "'actuator', 'joints' and 'arc_radius' must be finite", np.isfinite(numbers).all()

@@ -1,8 +1,7 @@
 """Antipodal grasps from the edges of a height map: a geometric baseline without networks.
 
-For every place and yaw, the map is read along the closing direction. Between the open fingers lies
-what is higher than the tips will be; its outermost edges are where the fingers meet it. A grasp is
-good where both edges are square to the fingers, and both fingers come down on free ground.
+A grasp is good where the outermost edges between the fingers, higher than the tips will be, are
+square to the fingers, and both fingers come down on free ground.
 
 K = yaws over half a turn, S = cells along a side of the rotated maps, D = cells from the middle of
 the hand to the far side of a finger.
@@ -15,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax import Array
 
 from csac_jax import grippers
 from csac_jax.config import Config
@@ -29,11 +29,7 @@ CANDIDATES = 1024  # best grasps, of which the best within reach is chosen
 
 @struct.dataclass
 class Weights:
-    """Costs of a grasp's flaws.
-
-    Ours, by `csac-jax bench geometric`; the noise only helps where two failures do not end the
-    episode.
-    """
+    """Costs of a grasp's flaws (ours)."""
 
     tilt: float = 2.0  # of an edge against the pad, per rad
     offset: float = 10.0  # of the held part's middle from the hand's, along the closing, per m
@@ -43,27 +39,12 @@ class Weights:
     noise: float = 0.5  # random, per failure: another grasp is tried
 
 
-class Profile(NamedTuple):
-    """Surface on one side of the middle of the hand, [K, S, S] each."""
-
-    edge: jax.Array  # m, farthest that is above the tips; 0 where nothing is
-    filled: jax.Array  # m, of the way there that is above the tips
-    tilt: jax.Array  # rad, of the edge against the pad
-    free: jax.Array  # bool, the finger comes down on free ground
-
-
 def grasp(
-    key: jax.Array,
-    cfg: Config,
-    height: jax.Array,
-    wanted: jax.Array,
-    failures: jax.Array,
-    weights: Weights,
+    key: Array, cfg: Config, height: Array, wanted: Array, failures: Array, weights: Weights
 ) -> Action:
-    """Returns the best antipodal grasp of a height map, within the robot's reach.
+    """Returns the best antipodal grasp of a map `height` [H, W] m, within the robot's reach.
 
-    Args: height [H, W] m; wanted [H, W] bool, where the middle of the hand may be; failures [],
-    actions in a row that lifted nothing.
+    Args: wanted [H, W] bool, where the hand may be; failures [], actions that lifted nothing.
     """
     yaws = np.arange(YAWS) * np.pi / YAWS
     places = _places(cfg, yaws)  # [K, S, S, 2] m
@@ -92,32 +73,32 @@ def _places(cfg: Config, yaws: np.ndarray) -> np.ndarray:
     return np.stack([cos * ahead - sin * across, sin * ahead + cos * across], axis=-1)
 
 
-def _sampled(cfg: Config, values: jax.Array, places: np.ndarray) -> jax.Array:
-    """Samples a map [H, W] at places [K, S, S, 2] m, 0 outside of it; [K, S, S]."""
+def _sampled(cfg: Config, values: Array, places: np.ndarray) -> Array:
+    """Samples a map [H, W] at places [K, S, S, 2] m, 0 outside of it."""
     cells = places / cfg.heightmap.cell + 0.5 * (cfg.heightmap.size - 1)
     row_col = [jnp.asarray(cells[..., axis], jnp.float32) for axis in (1, 0)]
     return jax.scipy.ndimage.map_coordinates(values, row_col, order=1)
 
 
-def _scores(cfg: Config, gripper: Gripper, maps: jax.Array, weights: Weights) -> jax.Array:
+def _scores(cfg: Config, gripper: Gripper, maps: Array, weights: Weights) -> Array:
     """Scores the grasp above each cell, [K, S, S]; very low where a finger collides."""
     cell = cfg.heightmap.cell
     reach = round(0.5 * gripper.finger[1] / cell)  # rows that a finger covers on either side
     top = _window(_window(maps, -1, reach), -2, reach)
     depth = grasp_depth(cfg.sim, gripper)
     tip = jnp.maximum(top - depth, lowest(cfg.sim, gripper))
-    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4))
-    sides = [_profile(hand, maps, way) for way in (1, -1)]
-    width = sides[0].edge + sides[1].edge
+    inner = int(gripper.half[1] / cell)
+    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4), inner)
+    edges, filled, tilts, free = zip(*(_profile(hand, maps, way) for way in (1, -1)), strict=True)
+    width = sum(edges)
     between = [_covered(hand, _shifted(maps, -2, row)) for row in range(-reach, reach + 1)]
     held = sum(between[1:], between[0]) / len(between)
     good = weights.grip * held * jnp.minimum(top - tip, depth)
-    bad = weights.tilt * (sides[0].tilt + sides[1].tilt) + weights.width * width
-    bad += weights.offset * jnp.abs(sides[0].filled - sides[1].filled)
+    bad = weights.tilt * sum(tilts) + weights.width * width
+    bad += weights.offset * jnp.abs(filled[0] - filled[1])
     bad += weights.middle * _aside(hand, maps)
     fits = (width < gripper.opening[1] - cell) & (top > jnp.maximum(tip, BARE))
-    possible = sides[0].free & sides[1].free & fits
-    return good - bad - jnp.where(possible, 0.0, 1e3)
+    return good - bad - jnp.where(free[0] & free[1] & fits, 0.0, 1e3)
 
 
 class Hand(NamedTuple):
@@ -126,22 +107,22 @@ class Hand(NamedTuple):
     gripper: Gripper
     cell: float  # m
     reach: int  # rows that a finger covers on either side
-    tip: jax.Array  # [K, S, S] m, how high the tips are
-    below: jax.Array  # [K, S, S] m, the same below the surface, above 0
-
-    @property
-    def inner(self) -> int:
-        """Returns the cells from the middle to an open finger."""
-        return int(self.gripper.half[1] / self.cell)
+    tip: Array  # [K, S, S] m, how high the tips are
+    below: Array  # [K, S, S] m, the same below the surface, above 0
+    inner: int  # cells from the middle to an open finger
 
 
-def _covered(hand: Hand, maps: jax.Array) -> jax.Array:
+def _covered(hand: Hand, maps: Array) -> Array:
     """Returns the share of the cell above the tips [K, S, S]: edges lie between cells."""
     return jnp.clip((maps - hand.tip) / hand.below, 0.0, 1.0)
 
 
-def _profile(hand: Hand, maps: jax.Array, way: int) -> Profile:
-    """Measures the side that one finger meets, `way` 1 ahead or -1 behind."""
+def _profile(hand: Hand, maps: Array, way: int) -> tuple[Array, Array, Array, Array]:
+    """Measures the surface that one finger meets, `way` 1 ahead or -1 behind, [K, S, S] each.
+
+    Returns: m to the farthest cell above the tips, 0 if there is none; m of the way there that are
+    above the tips; rad of that edge against the pad; bool, the finger comes down on free ground.
+    """
     gripper, cell = hand.gripper, hand.cell
     room = gripper.footprint[0] + 0.5 * cell
     under = gripper.half[1] + 0.5 * gripper.finger[0]  # m, middle of the finger
@@ -161,10 +142,10 @@ def _profile(hand: Hand, maps: jax.Array, way: int) -> Profile:
     for number in range(int((under - room) / cell), int((under + room) / cell) + 1):
         free &= _shifted(wide, -1, way * number) < hand.tip
     tilt = jnp.arctan2(jnp.abs(ends[1] - ends[0]), 2.0 * hand.reach * cell)
-    return Profile(edge, filled, tilt, free)
+    return edge, filled, tilt, free
 
 
-def _aside(hand: Hand, maps: jax.Array) -> jax.Array:
+def _aside(hand: Hand, maps: Array) -> Array:
     """Measures the offset of the held part's middle across the closing [K, S, S] m."""
     lengths = []
     for way in (1, -1):
@@ -177,12 +158,10 @@ def _aside(hand: Hand, maps: jax.Array) -> jax.Array:
     return 0.5 * jnp.abs(lengths[0] - lengths[1])
 
 
-def _shifted(maps: jax.Array, axis: int, cells: int) -> jax.Array:
-    """Shifts by `cells` along `axis`: each takes the value ahead. Maps are 0 at their rims."""
-    return jnp.roll(maps, -cells, axis)
+def _shifted(maps: Array, axis: int, cells: int) -> Array:
+    return jnp.roll(maps, -cells, axis)  # each takes the value ahead; maps are 0 at their rims
 
 
-def _window(maps: jax.Array, axis: int, reach: int) -> jax.Array:
-    """Returns the highest value within `reach` cells along `axis`."""
+def _window(maps: Array, axis: int, reach: int) -> Array:
     shifted = [_shifted(maps, axis, cells) for cells in range(-reach, reach + 1)]
     return jnp.max(jnp.stack(shifted), axis=0)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from csac_jax import grippers
 from csac_jax.config import Config, SlotKind
@@ -26,30 +27,25 @@ ALIGNED = 0.01  # 1 - cosine between a face and the pad that is as good as paral
 class GraspTarget(NamedTuple):
     """A block, or a convex part of an object. F = faces."""
 
-    slot: jax.Array  # [] int32
-    centre: jax.Array  # [2] m
-    normal: jax.Array  # [F, 3] world frame, 0 where there is no face
-    offset: jax.Array  # [F] m, from the centre
+    slot: Array  # [] int32
+    centre: Array  # [2] m
+    normal: Array  # [F, 3] world frame, 0 where there is no face
+    offset: Array  # [F] m, from the centre
 
 
 class GraspCandidates(NamedTuple):
     """Grasps to choose from. n = candidates."""
 
-    slot: jax.Array  # [n] int32, of the target
-    score: jax.Array  # [n], -inf where impossible
-    pose: jax.Array  # [n, 3] m, m, rad
+    slot: Array  # [n] int32, of the target
+    score: Array  # [n], -inf where impossible
+    pose: Array  # [n, 3] m, m, rad
 
 
-def grasp(
-    cfg: Config, scene: SceneState, height: jax.Array, failures: jax.Array | int = 0
-) -> Action:
+def grasp(cfg: Config, scene: SceneState, height: Array, failures: Array | int = 0) -> Action:
     """Plans the best grasp: room for both fingers, faces square to the pads, a high, narrow block.
 
-    Grasps out of the robot's reach are left out. With a target, the best grasp is the target's,
-    else that of the block nearest to it. Each of several `failures` [] in a row moves to another
-    block, then to another grasp of it.
-
-    Args: height [H, W] m.
+    With a target, it is the target's, else that of the block nearest to it. Each of several
+    `failures` [] in a row moves to another block, then to another grasp of it. `height` [H, W] m.
     """
     parts = [_of_blocks(cfg, scene, height)]
     if cfg.scene.has_objects:
@@ -59,7 +55,7 @@ def grasp(
     return Action(primitive=jnp.int32(Primitive.GRASP), pose=candidates.pose[chosen])
 
 
-def _in_turn(candidates: GraspCandidates, slots: int, failures: jax.Array) -> jax.Array:
+def _in_turn(candidates: GraspCandidates, slots: int, failures: Array) -> Array:
     """Returns the index [] of the next grasp to try, the best first."""
     slot, score = candidates.slot, candidates.score
     best = jax.ops.segment_max(score, slot, slots)
@@ -70,26 +66,23 @@ def _in_turn(candidates: GraspCandidates, slots: int, failures: jax.Array) -> ja
     return ranked[(failures // graspable * OTHER_WAY) % jnp.maximum(jnp.sum(of_block), 1)]
 
 
-def _of_blocks(cfg: Config, scene: SceneState, height: jax.Array) -> GraspCandidates:
-    """Returns grasps of blocks: at the middle and towards both ends."""
-    hulls: tuple[SlotKind, ...] = tuple(
-        "box" if kind == "arch" else kind for kind in cfg.scene.slots
-    )
+def _of_blocks(cfg: Config, scene: SceneState, height: Array) -> GraspCandidates:
+    convex: dict[SlotKind, SlotKind] = {"arch": "box"}
+    hulls = tuple(convex.get(kind, kind) for kind in cfg.scene.slots)
     normals, offsets = blocks.half_spaces(hulls, scene.half_size)
     slot = blocks.parts(hulls).slot
     rotation = jax.vmap(quat_to_matrix)(scene.quaternion)[slot]
-    world_normals = jnp.einsum("nij,nfj->nfi", rotation, normals, precision=EXACT)
-    centre = scene.position[slot, :2]
-    targets = GraspTarget(jnp.asarray(slot, jnp.int32), centre, world_normals, offsets)
+    turned = jnp.einsum("nij,nfj->nfi", rotation, normals, precision=EXACT)
+    number = jnp.asarray(slot, jnp.int32)
+    targets = GraspTarget(number, scene.position[slot, :2], turned, offsets)
     return _candidates(cfg, scene, height, targets, SHIFTS)
 
 
-def _of_objects(cfg: Config, scene: SceneState, height: jax.Array) -> GraspCandidates:
-    """Returns grasps of the parts of objects, at their middles."""
+def _of_objects(cfg: Config, scene: SceneState, height: Array) -> GraspCandidates:
     known, slots = object_slots.table(cfg.scene), np.flatnonzero(blocks.is_object(cfg.scene.slots))
     count = known.present.shape[1]
 
-    def of_slot(slot: jax.Array) -> GraspCandidates:
+    def of_slot(slot: Array) -> GraspCandidates:
         number = scene.numbers[slot]
         normal, offset, part, middle, present = (
             jnp.asarray(leaf)[number]
@@ -108,8 +101,8 @@ def _of_objects(cfg: Config, scene: SceneState, height: jax.Array) -> GraspCandi
             offset.reshape(1, -1) - inner,
         )
         grasps = _candidates(cfg, scene, height, targets, (0.0,))
-        exists = jnp.repeat(present, YAWS)
-        return grasps._replace(score=jnp.where(exists, grasps.score, -jnp.inf))
+        score = jnp.where(jnp.repeat(present, YAWS), grasps.score, -jnp.inf)
+        return grasps._replace(score=score)
 
     # One after the other: the masks of all grasps of all parts would not fit the memory.
     grasps = jax.lax.map(of_slot, jnp.asarray(slots, jnp.int32))
@@ -117,24 +110,21 @@ def _of_objects(cfg: Config, scene: SceneState, height: jax.Array) -> GraspCandi
 
 
 def _candidates(
-    cfg: Config,
-    scene: SceneState,
-    height: jax.Array,
-    targets: GraspTarget,
-    shifts: tuple[float, ...],
+    cfg: Config, scene: SceneState, height: Array, targets: GraspTarget, shifts: tuple[float, ...]
 ) -> GraspCandidates:
     """Scores grasps of targets, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
     fingers = scene_state.fingers(scene, gripper)
-    beside, (along, across_pad) = fingers.finger_offset, fingers.footprint
+    beside = 0.5 * fingers.opening + 0.5 * fingers.thickness  # m, to the middle of a finger
+    along, across_pad = fingers.footprint
     slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
-    def place(target: GraspTarget, yaw: jax.Array, shift: jax.Array) -> jax.Array:
+    def place(target: GraspTarget, yaw: Array, shift: Array) -> Array:
         across = rotate2d(yaw, jnp.array([0.0, 1.0]))
         cosine = jnp.matmul(target.normal[:, :2], across, precision=EXACT)
         return target.centre + shift * target.offset[jnp.argmax(cosine)] * across
 
-    def score(target: GraspTarget, yaw: jax.Array, shift: jax.Array) -> jax.Array:
+    def score(target: GraspTarget, yaw: Array, shift: Array) -> Array:
         axis = jnp.append(rotate2d(yaw, jnp.array([1.0, 0.0])), 0.0)
         cosine = jnp.matmul(target.normal, axis, precision=EXACT)
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads

@@ -10,14 +10,9 @@ import tyro
 
 from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import (
-    PROGRAM,
-    BadArgumentsError,
-    as_bad_arguments,
-    check_extra,
-    check_seed,
-)
-from csac_jax.errors import FailedError
+from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
+from csac_jax.cli.parsing import PROGRAM
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.runtime import processes
 
 
@@ -40,8 +35,7 @@ class MakeOptions:
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
     """Makes a library of mesh files (.obj, .stl, .ply, .glb), URDF or MJCF. Each is split into
-    convex parts, which takes seconds to a minute. Unusable files are named and left out. In a
-    folder with URDF or MJCF, the meshes are parts of these."""
+    convex parts, in seconds to a minute. Unusable files are named and left out."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Files, and folders of them."""
@@ -78,7 +72,7 @@ def run(arguments: list[str]) -> int:
         print(f"usage: {PROGRAM} objects COMMAND ..., with COMMAND one of: {known}")
         return 0 if name else 2
     if name not in COMMANDS:
-        raise BadArgumentsError(f"objects: {unknown('command', name, COMMANDS)}")
+        raise SettingsError(f"objects: {unknown('command', name, COMMANDS)}")
     return COMMANDS[name](rest)
 
 
@@ -88,7 +82,7 @@ def _make(arguments: list[str]) -> int:
     from csac_jax.objects import library, shapes
 
     if not 1 <= options.count <= library.MOST_OBJECTS:
-        raise BadArgumentsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
+        raise SettingsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
     _check_new(options.out)
     draw = shapes.draw_mixed if options.mixed else shapes.draw
     made = library.save(options.out, draw(options.seed, options.count)).objects
@@ -102,48 +96,45 @@ def _import(arguments: list[str]) -> int:
     options = parsing.parse(ImportOptions, arguments, "objects import")
     _check_new(options.out)
     if not (0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024):
-        raise BadArgumentsError("--scale must be positive, --jobs lie in 0 .. 1024")
+        raise SettingsError("--scale must be positive, --jobs lie in 0 .. 1024")
     from csac_jax.objects import body, conversion, importing, library
 
     least, most = body.DENSITIES
     if not least <= options.density <= most:
-        raise BadArgumentsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
+        raise SettingsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
     with as_bad_arguments(ValueError):
         paths = importing.files(list(options.paths))
     if len(paths) > library.MOST_OBJECTS:
-        raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
+        raise SettingsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
     jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
     settings = conversion.ImportSettings(options.scale, options.density)
-    bar = output.progress()
-    task = bar.add_task("splitting into convex parts", total=None)
+    with output.progress() as bar:
+        task = bar.add_task("splitting into convex parts", total=None)
 
-    def on_progress(finished: int, total: int, name: str) -> None:
-        bar.update(task, description=name, completed=finished, total=total)
+        def on_progress(finished: int, total: int, name: str) -> None:
+            bar.update(task, description=name, completed=finished, total=total)
 
-    with bar:
-        result = importing.run(paths, settings, jobs, cache, on_progress)
-    for line in result.refused:
+        converted, refused = importing.run(paths, settings, jobs, cache, on_progress)
+    for line in refused:
         print(f"{PROGRAM}: {line}", file=sys.stderr)
-    if not result.objects:
+    if not converted:
         raise FailedError(f"none of {len(paths)} files can be imported; nothing is written")
-    _list(library.save(options.out, result.objects).objects)
+    _list(library.save(options.out, [member for member, _ in converted]).objects)
     shutil.rmtree(cache, ignore_errors=True)
-    for name, share in result.volumes.items():
+    for member, share in converted:
         if not importing.SOUND[0] <= share <= importing.SOUND[1]:
-            print(f"{name}: its parts have {share:.2f} of the mesh's volume; check it")
-    print(f"wrote {options.out}; {len(result.refused)} of {len(paths)} files left out")
-    rows = [
-        _row(member) | {"parts_volume": result.volumes[member.name]} for member in result.objects
-    ]
-    output.write_result(options.json, {"objects": rows, "refused": result.refused})
+            print(f"{member.name}: its parts have {share:.2f} of the mesh's volume; check it")
+    print(f"wrote {options.out}; {len(refused)} of {len(paths)} files left out")
+    rows = [_row(member) | {"parts_volume": share} for member, share in converted]
+    output.write_result(options.json, {"objects": rows, "refused": refused})
     return 0
 
 
 def _check_new(folder: Path) -> None:
     if folder.exists():
-        raise BadArgumentsError(f"--out: {folder} exists; give another name")
+        raise SettingsError(f"--out: {folder} exists; give another name")
 
 
 def _show(arguments: list[str]) -> int:
@@ -178,7 +169,6 @@ def _row(member: Any) -> dict[str, Any]:
 
 
 def _list(objects: Any) -> None:
-    """Prints the objects as a table, then names those too wide for the default gripper."""
     from rich.console import Console
     from rich.table import Table
 
@@ -187,10 +177,9 @@ def _list(objects: Any) -> None:
 
     rows = [_row(member) for member in objects]
     table = Table("object", "size, mm", "narrowest, mm", "mass, g", "parts", "split")
-    for row in rows:
-        size = " x ".join(f"{side:.0f}" for side in row["size_mm"])
-        numbers = (f"{row['narrowest_mm']:.0f}", f"{row['mass_g']:.0f}", str(row["parts"]))
-        table.add_row(row["name"], size, *numbers, row["split"])
+    for name, sides, narrowest, mass, *rest in map(dict.values, rows):
+        size = " x ".join(f"{side:.0f}" for side in sides)
+        table.add_row(name, size, f"{narrowest:.0f}", f"{mass:.0f}", *map(str, rest))
     Console(highlight=False).print(table)
     held_out = sum(row["split"] == "held_out" for row in rows)
     print(f"{len(rows)} objects, {held_out} of them held out")

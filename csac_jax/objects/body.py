@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from csac_jax.objects import solid
-from csac_jax.objects.solid import Part
+from csac_jax.objects.solid import Moments, Part
 
 HELD_OUT = 0.2  # share of the names
 MOST_PARTS = 32
@@ -43,27 +44,21 @@ class Object:
     @property
     def narrowest(self) -> float:
         """Returns the least width, m, between parallel planes, one along a face of the hull."""
-        return solid.narrowest(self.parts)
+        points = np.concatenate([part.vertices for part in self.parts])
+        hull = ConvexHull(points)
+        along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])
+        return float(np.ptp(along, axis=1).min())
 
     @property
     def held_out(self) -> bool:
         """Returns True for an object kept for evaluation: decided by digests, never by hand."""
         names = (self.source_sha256 or self.name, self.family)
-        return any(_fraction(name) < HELD_OUT for name in names if name)
+        digests = (hashlib.sha256(name.encode()).digest() for name in names if name)
+        return any(int.from_bytes(d[:8], "big") / 2**64 < HELD_OUT for d in digests)
 
 
-def _fraction(name: str) -> float:
-    """Hashes a name to a number in 0 .. 1."""
-    return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big") / 2**64
-
-
-def make(
-    name: str, parts: Sequence[Part], whole: solid.Moments | None = None, **more: Any
-) -> Object:
-    """Builds an object of convex parts, its centre of mass at the origin.
-
-    `whole` has the integrals of the body; without it, those of the parts, which must not overlap.
-    """
+def make(name: str, parts: Sequence[Part], whole: Moments | None = None, **more: Any) -> Object:
+    """Builds an object of convex parts, which must not overlap unless `whole` has its integrals."""
     whole = whole or solid.joined(map(solid.moments, parts))
     com = whole.first / whole.volume
     shifted = [solid.moved(part, -com) for part in parts]

@@ -1,8 +1,7 @@
 """One file to an object: read by trimesh, split into convex parts by CoACD (extra `objects`).
 
-A mesh file is read from memory, so that it can name no other file. URDF and MJCF, which name mesh
-files, are read by `descriptions`. A shape must be closed: volume, inertia and parts of an open one
-are not defined.
+A mesh file is read from memory, so that it can name no other file. A shape must be closed: volume,
+inertia and parts of an open one are not defined.
 """
 
 import contextlib
@@ -40,11 +39,8 @@ def convert(path: Path, name: str, settings: ImportSettings) -> tuple[Object, fl
     content, mesh = read(path)
     mesh = _closed(mesh, settings.scale)
     coacd.set_log_level("error")
-    hulls = coacd.run_coacd(
-        coacd.Mesh(mesh.vertices, mesh.faces), threshold=_THRESHOLD, max_convex_hull=_PARTS
-    )
-    parts = []
-    for corners, _ in hulls:
+    whole, parts = coacd.Mesh(mesh.vertices, mesh.faces), []
+    for corners, _ in coacd.run_coacd(whole, threshold=_THRESHOLD, max_convex_hull=_PARTS):
         with contextlib.suppress(ValueError):  # a part without volume
             parts.append(solid.simplified(corners))
     if not parts:
@@ -58,10 +54,7 @@ def convert(path: Path, name: str, settings: ImportSettings) -> tuple[Object, fl
 
 
 def read(path: Path) -> tuple[bytes, Any]:
-    """Reads a file: its content, and its mesh as an object of trimesh.
-
-    The content of a description includes the mesh's corners, which are in other files.
-    """
+    """Reads a file: its content, with corners that are in other files, and its mesh of trimesh."""
     content, kind = path.read_bytes(), path.suffix.lower()
     described = kind in descriptions.SUFFIXES
     mesh = descriptions.read(path) if described else _read_mesh(content, kind[1:])
@@ -83,7 +76,6 @@ def _read_mesh(content: bytes, kind: str) -> Any:
 
 
 def _closed(mesh: Any, scale: float) -> Any:
-    """Scales a mesh to metres and closes small holes. Raises ValueError for other holes."""
     mesh.apply_scale(scale)
     size = float(np.ptp(mesh.vertices, axis=0).max())
     if not 2e-3 <= size <= body.LARGEST:
@@ -106,7 +98,6 @@ def _closed(mesh: Any, scale: float) -> Any:
 
 
 def _moments(mesh: Any) -> solid.Moments:
-    """Integrates over a closed mesh, from trimesh's inertia about the centre of mass."""
     com, inertia = mesh.center_mass, mesh.moment_inertia
     about = 0.5 * np.trace(inertia) * np.eye(3) - inertia
     return solid.Moments(mesh.volume, mesh.volume * com, about + mesh.volume * np.outer(com, com))

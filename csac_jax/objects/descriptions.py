@@ -36,17 +36,20 @@ def read(path: Path) -> Any:
     geoms = np.flatnonzero(collides | ~collides.any())
     if not geoms.size:
         raise ValueError("has no geom")
-    return _joined([_placed(model, data, int(geom)) for geom in geoms])
+    import trimesh
+
+    meshes = [_placed(model, data, int(geom)) for geom in geoms]
+    if len(meshes) == 1:
+        return meshes[0]
+    closed = all(mesh.is_volume for mesh in meshes)  # overlaps count once
+    return trimesh.boolean.union(meshes) if closed else trimesh.util.concatenate(meshes)
 
 
 def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Raises ValueError for a mesh file outside of the description's folder."""
     for mesh in spec.meshes:
         file = (folder / spec.meshdir / mesh.file).resolve()
         if mesh.file and not file.is_relative_to(folder):
-            raise ValueError(
-                f"names '{mesh.file}', which lies outside of its folder; move it there"
-            )
+            raise ValueError(f"names '{mesh.file}', outside of its folder; move it there")
 
 
 def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
@@ -54,35 +57,24 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
     import trimesh
 
     size, kind, make = model.geom_size[geom], int(model.geom_type[geom]), trimesh.creation
-    if kind == _Geom.mjGEOM_MESH:
+
+    def mesh_of_model() -> Any:
         number = model.geom_dataid[geom]
         first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
         begin, faces = model.mesh_faceadr[number], model.mesh_facenum[number]
         corners, triangles = model.mesh_vert[first:][:count], model.mesh_face[begin:][:faces]
-        mesh = trimesh.Trimesh(corners, triangles, process=False)
-    elif kind == _Geom.mjGEOM_BOX:
-        mesh = make.box(2.0 * size)
-    elif kind == _Geom.mjGEOM_SPHERE:
-        mesh = make.icosphere(3, size[0])
-    elif kind == _Geom.mjGEOM_ELLIPSOID:
-        mesh = make.icosphere(3, 1.0).apply_scale(size)
-    elif kind == _Geom.mjGEOM_CYLINDER:
-        mesh = make.cylinder(size[0], 2.0 * size[1])
-    elif kind == _Geom.mjGEOM_CAPSULE:
-        mesh = make.capsule(2.0 * size[1], size[0])
-    else:
+        return trimesh.Trimesh(corners, triangles, process=False)
+
+    makers = {
+        _Geom.mjGEOM_MESH: mesh_of_model,
+        _Geom.mjGEOM_BOX: lambda: make.box(2.0 * size),
+        _Geom.mjGEOM_SPHERE: lambda: make.icosphere(3, size[0]),
+        _Geom.mjGEOM_ELLIPSOID: lambda: make.icosphere(3, 1.0).apply_scale(size),
+        _Geom.mjGEOM_CYLINDER: lambda: make.cylinder(size[0], 2.0 * size[1]),
+        _Geom.mjGEOM_CAPSULE: lambda: make.capsule(2.0 * size[1], size[0]),
+    }
+    if kind not in makers:
         raise ValueError(f"has a geom of kind {_Geom(kind).name[7:].lower()}; give it a mesh")
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    return mesh.apply_transform(place)
-
-
-def _joined(meshes: list[Any]) -> Any:
-    """Merges meshes to one; where all are closed, overlaps count once."""
-    import trimesh
-
-    if len(meshes) == 1:
-        return meshes[0]
-    if all(mesh.is_volume for mesh in meshes):
-        return trimesh.boolean.union(meshes)
-    return trimesh.util.concatenate(meshes)
+    return makers[_Geom(kind)]().apply_transform(place)

@@ -3,13 +3,13 @@
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
 
 from csac_jax.objects import conversion, descriptions, library, solid
 from csac_jax.objects.body import Object
@@ -24,33 +24,24 @@ _MEMORY = 2**33  # bytes that one worker may ask for
 Converted = tuple[Object, float]  # with the volume of its parts / volume of the mesh
 
 
-class ImportResult(NamedTuple):
-    """Objects made of files, and the files that gave none."""
-
-    objects: list[Object]
-    volumes: dict[str, float]  # by name: volume of the parts / volume of the mesh
-    refused: list[str]  # one line each, with the file
-
-
 def files(paths: list[Path]) -> list[Path]:
     """Lists the importable files among these files and in these folders, sorted.
 
-    Of a folder with URDF or MJCF only these are taken: its meshes are parts of them. Raises
-    ValueError for a path that is missing or has none.
+    The meshes in a folder with URDF or MJCF are parts of these. Raises ValueError for a path that
+    is missing or has none.
     """
     chosen: list[Path] = []
     for path in paths:
         if not path.exists():
             raise ValueError(f"{path} does not exist")
         inside = [file for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file()]
-        described, meshes = (
-            [file for file in inside if file.suffix.lower() in suffixes]
-            for suffixes in (descriptions.SUFFIXES, MESHES)
-        )
-        if not described and not meshes:
+        for suffixes in (descriptions.SUFFIXES, MESHES):
+            if files := sorted(file for file in inside if file.suffix.lower() in suffixes):
+                break
+        else:
             known = ", ".join((*MESHES, *descriptions.SUFFIXES))
             raise ValueError(f"{path}: no mesh file; known are: {known}")
-        chosen += sorted(described or meshes)
+        chosen += files
     return list(dict.fromkeys(chosen))
 
 
@@ -60,19 +51,21 @@ def run(
     jobs: int,
     cache: Path,
     on_progress: Callable[[int, int, str], None],  # finished, all, name of the latest
-) -> ImportResult:
-    """Converts files in `jobs` processes; the folder `cache` keeps finished objects."""
-    names = _names(paths)
-    done: dict[Path, Converted] = {}
-    refused: dict[Path, str] = {}
-    for path in paths:
-        if (entry := _cached(cache, path, names[path], settings)) is not None:
-            done[path] = entry
+) -> tuple[list[Converted], list[str]]:
+    """Converts files in `jobs` processes; the folder `cache` keeps finished objects.
+
+    Returns: the objects; of each file that gave none, one line.
+    """
+    names, refused = _names(paths), dict[Path, str]()
+    cached = {path: _cached(cache, path, names[path], settings) for path in paths}
+    done = {path: entry for path, entry in cached.items() if entry is not None}
 
     def finish(path: Path, task: Future) -> None:
         try:
             done[path] = task.result()
-            _store(cache, path, settings, done[path][0])
+            folder = _entry(cache, path, settings)
+            if not folder.exists():
+                library.save(folder, [done[path][0]])
         except (ValueError, OSError, MemoryError) as error:
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             refused[path] = f"{path}: {reason}"
@@ -83,10 +76,8 @@ def run(
     for path in unfinished:  # a crash ends all processes of a pool: now each file in its own
         if _convert([path], 1, names, settings, finish):
             refused[path] = f"{path}: CoACD crashed or ran out of memory; mend or reduce its mesh"
-    entries = [done[path] for path in paths if path in done]
-    volumes = {converted.name: share for converted, share in entries}
     lines = [refused[path] for path in paths if path in refused]
-    return ImportResult([converted for converted, _ in entries], volumes, lines)
+    return [done[path] for path in paths if path in done], lines
 
 
 def _convert(
@@ -97,11 +88,13 @@ def _convert(
     on_done: Callable[[Path, Future], None],
 ) -> list[Path]:
     """Converts files in `jobs` processes; returns those left unfinished by a process that ended."""
-    unfinished = []
-    with _pool(max(min(jobs, len(paths)), 1)) as pool:
-        tasks = {
-            pool.submit(conversion.convert, path, names[path], settings): path for path in paths
-        }
+    unfinished, limit = [], (resource.RLIMIT_AS, (_MEMORY, _MEMORY))
+    number = max(min(jobs, len(paths)), 1)
+    pool = ProcessPoolExecutor(number, get_context("spawn"), resource.setrlimit, limit)
+    with contextlib.ExitStack() as stack:
+        stack.callback(pool.shutdown, cancel_futures=True)
+        submit = pool.submit
+        tasks = {submit(conversion.convert, path, names[path], settings): path for path in paths}
         for task in as_completed(tasks):
             if isinstance(task.exception(), BrokenProcessPool):
                 unfinished.append(tasks[task])
@@ -110,30 +103,13 @@ def _convert(
     return unfinished
 
 
-@contextlib.contextmanager
-def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Starts processes of bounded memory; an error in the block cancels waiting tasks."""
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_limit_memory)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _limit_memory() -> None:
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-
-
 def _names(paths: list[Path]) -> dict[Path, str]:
     """Names each file by its stem, with a number where several have the same."""
     names: dict[Path, str] = {}
     for path in paths:
         stem = "".join(c if c.isprintable() else "_" for c in path.stem)[:90] or "object"
-        name, number = stem, 1
-        while name in names.values():
-            number += 1
-            name = f"{stem}-{number}"
-        names[path] = name
+        choices = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
+        names[path] = next(name for name in choices if name not in names.values())
     return names
 
 
@@ -151,9 +127,3 @@ def _cached(cache: Path, path: Path, name: str, settings: ImportSettings) -> Con
             share = sum(solid.moments(part).volume for part in entry.parts) / entry.volume
             return dataclasses.replace(entry, name=name), share
     return None
-
-
-def _store(cache: Path, path: Path, settings: ImportSettings, converted: Object) -> None:
-    folder = _entry(cache, path, settings)
-    if not folder.exists():
-        library.save(folder, [converted])

@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import shutil
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -64,61 +63,50 @@ def select(library: Library, split: Split) -> Library:
     held_out = split == "held_out"
     members = tuple(member for member in library.objects if member.held_out == held_out)
     if not members:
-        raise LibraryError(
-            f"none of the {len(library.objects)} objects is of the split {split}; "
-            "make a larger library, or take the split all"
-        )
+        none = f"none of the {len(library.objects)} objects is of the split {split}"
+        raise LibraryError(f"{none}; make a larger library, or take the split all")
     return Library(members, hashlib.sha256(f"{split} {library.sha256}".encode()).hexdigest())
 
 
 def save(folder: Path, objects: Sequence[Object]) -> Library:
-    """Writes a library; its folder appears at once, complete.
-
-    Raises OSError, FileExistsError for a folder that exists.
-    """
+    """Writes a library; its folder appears at once, complete. Raises OSError."""
     if folder.exists():
         raise FileExistsError(f"{folder} exists; give another name")
-    arrays = _pack(objects)
-    index = _index(objects, arrays)
+    arrays, entries = _pack(objects), [_entry(member) for member in objects]
+    fields = {"format": FORMAT, "sha256": _digest(entries, arrays), "objects": entries}
+    index = (json.dumps(fields, indent=1) + "\n").encode()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as parent:
+        draft = Path(parent) / folder.name
+        draft.mkdir()
         for name, content in ((ARRAYS, arrays), (INDEX, index)):
             with (draft / name).open("wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
-        draft.chmod(0o755)
         draft.rename(folder)
-    except OSError:
-        shutil.rmtree(draft, ignore_errors=True)
-        raise
     return Library(tuple(objects), hashlib.sha256(index).hexdigest())
 
 
 def _pack(objects: Iterable[Object]) -> bytes:
-    """Packs all parts to an array file; `counts` has the corners, triangles and planes of each."""
     parts = [part for member in objects for part in member.parts]
-    fields = ("vertices", "triangles", "planes")
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in fields
-    }
-    counts = [[len(getattr(part, name)) for name in fields] for part in parts]
+    *fields, _ = _DTYPES
+    rows = [[getattr(part, name) for name in fields] for part in parts]
+    arrays: Any = dict(zip(fields, map(np.concatenate, zip(*rows, strict=True)), strict=True))
     file = io.BytesIO()
-    np.savez(file, **arrays, counts=np.array(counts, np.int32))
+    np.savez(file, **arrays, counts=np.array([[*map(len, row)] for row in rows], np.int32))
     return file.getvalue()
+
+
+_TEXTS, _SIZES = ("name", "family", "source", "source_sha256"), ("scale", "volume", "density")
 
 
 def _digest(entries: Any, arrays: bytes) -> str:
     return hashlib.sha256(json.dumps(entries).encode() + arrays).hexdigest()
 
 
-_TEXTS, _SIZES = ("name", "family", "source", "source_sha256"), ("scale", "volume", "density")
-
-
 def _entry(member: Object) -> dict[str, Any]:
-    values = {name: getattr(member, name) for name in (*_TEXTS, "scale")}
-    return values | {
+    return {name: getattr(member, name) for name in (*_TEXTS, "scale")} | {
         "size": np.ptp(member.bounds, axis=0).tolist(),
         "volume": member.volume,
         "density": member.density,
@@ -127,12 +115,6 @@ def _entry(member: Object) -> dict[str, Any]:
         "parts": len(member.parts),
         "held_out": member.held_out,
     }
-
-
-def _index(objects: Iterable[Object], arrays: bytes) -> bytes:
-    entries = [_entry(member) for member in objects]
-    content = {"format": FORMAT, "sha256": _digest(entries, arrays), "objects": entries}
-    return (json.dumps(content, indent=1) + "\n").encode()
 
 
 _DAMAGE = (ArithmeticError, ValueError, LookupError, TypeError, RecursionError, BadZipFile)
@@ -152,13 +134,11 @@ def load(folder: Path) -> Library:
         raise LibraryError(f"{missing}; csac-jax objects make --out {folder} makes one") from None
     except _DAMAGE as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        damaged = f"{folder}: damaged library of objects: {reason}"
-        raise LibraryError(f"{damaged}; make it again") from None
+        raise LibraryError(f"{folder}: damaged library: {reason}; make it again") from None
 
 
 def _bytes(path: Path) -> bytes:
-    if not path.is_file() or path.stat().st_size > _MOST_BYTES:
-        path.stat()  # raises for one that is missing
+    if path.stat().st_size > _MOST_BYTES or not path.is_file():
         raise ValueError(f"{path.name} is no file, or larger than {_MOST_BYTES >> 20} MiB")
     return path.read_bytes()
 
@@ -166,8 +146,7 @@ def _bytes(path: Path) -> bytes:
 def _read(folder: Path, index: bytes) -> list[Object]:
     content = json.loads(index)
     if content["format"] != FORMAT:
-        stored = str(content["format"])[:20]
-        raise ValueError(f"format {stored} is unknown, this version reads {FORMAT}")
+        raise ValueError(f"format {content['format']} is unknown, this version reads {FORMAT}")
     packed, entries = _bytes(folder / ARRAYS), content["objects"]
     if _digest(entries, packed) != content["sha256"]:
         raise ValueError(f"the digest in {INDEX} is not that of the files")
@@ -200,15 +179,13 @@ def _parts(packed: bytes) -> list[Part]:
             raise ValueError(f"{name} does not fit the counts, or is not finite")
         rows.append(np.split(array, ends[:-1]))
     parts = [Part(*arrays) for arrays in zip(*rows, strict=True)]
-    if any(part.triangles.min() < 0 for part in parts) or any(
-        part.triangles.max() >= len(part.vertices) for part in parts
-    ):
+    if not all(0 <= p.triangles.min() <= p.triangles.max() < len(p.vertices) for p in parts):
         raise ValueError("triangles name corners that do not exist")
     return parts[::-1]
 
 
 def _object(entry: dict[str, Any], parts: list[Part]) -> Object:
-    """Builds the object of an entry, and takes its parts off the end of `parts`."""
+    """Builds the object of an entry; its parts are taken off the end of `parts`."""
     count = int(entry["parts"])
     if not 1 <= count <= min(body.MOST_PARTS, len(parts)):
         raise ValueError(f"1 to {body.MOST_PARTS} parts an object, not {count}")

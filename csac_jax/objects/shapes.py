@@ -1,8 +1,7 @@
 """Our own shapes: families of objects, each drawn from random numbers as convex parts.
 
-The parts of an object touch and do not overlap. The hand, which opens to 110 mm, can grasp each:
-a wider object has a thin wall, an arm or a handle. Round cross-sections are polygons, so that
-objects come to rest. z is up as the object stands.
+The parts of an object touch and do not overlap. A hand that opens to 110 mm can grasp each. Round
+cross-sections are polygons, so that objects come to rest. z is up as the object stands.
 """
 
 import itertools
@@ -28,7 +27,6 @@ def _circle(radius: float, sides: int = _ROUND) -> np.ndarray:
 
 
 def _frustum(low: np.ndarray, high: np.ndarray, bottom: float, top: float) -> Part:
-    """Builds the hull of two polygons [n, 2], one at each height."""
     ends = (np.column_stack([xy, np.full(len(xy), z)]) for xy, z in ((low, bottom), (high, top)))
     return solid.convex(np.concatenate([*ends]))
 
@@ -46,9 +44,8 @@ def _wall(
     inner: tuple[float, float], outer: tuple[float, float], bottom: float, top: float, sides: int
 ) -> list[Part]:
     """Builds the parts of a ring; radii at the bottom and at the top."""
-    radii = zip(inner, outer, strict=True)
+    radii, parts = zip(inner, outer, strict=True), []
     rings = [[_circle(inside, sides), _circle(outside, sides)] for inside, outside in radii]
-    parts = []
     for i in range(sides):
         edge = np.array([i, (i + 1) % sides])
         low, high = (np.concatenate([ring[0][edge], ring[1][edge[::-1]]]) for ring in rings)
@@ -91,10 +88,7 @@ def cup(rng: Generator) -> list[Part]:
 
 
 def superquadric(rng: Generator) -> list[Part]:
-    """Draws a superquadric as the hull of 34 of its points; convex, as e and f lie below 2.
-
-    (|x/a|^(2/e) + |y/b|^(2/e))^(e/f) + |z/c|^(2/f) = 1, Barr 1981.
-    """
+    """Draws a superquadric, (|x/a|^(2/e) + |y/b|^(2/e))^(e/f) + |z/c|^(2/f) = 1, Barr 1981."""
     half, (east, north) = rng.uniform(0.015, 0.04, 3), rng.uniform(0.25, 1.3, 2)
     around = np.pi * (np.arange(8) + 0.5) / 4.0
     up, across = np.meshgrid(np.radians([-54.0, -18.0, 18.0, 54.0]), around)
@@ -214,10 +208,7 @@ def brick(rng: Generator) -> list[Part]:
 
 
 def assembly(rng: Generator) -> list[Part]:
-    """Draws an assembly: one to three storeys of slanted, tapered or straight blocks.
-
-    One or two stand on the one below. The last storey may be a wall along the outline below it.
-    """
+    """Draws an assembly: one to three storeys of one or two blocks, the last perhaps a wall."""
     storeys = int(rng.integers(1, 4))
     parts: list[Part] = []
     below = np.zeros((1, 2))
@@ -261,10 +252,7 @@ def _fence(rng: Generator, outline: np.ndarray, bottom: float, top: float) -> li
 
 
 def _footprint(rng: Generator, reach: float) -> np.ndarray:
-    """Draws a rectangle or a convex polygon of 3 to 7 corners [n, 2] around the origin.
-
-    Its corners lie at most `reach` m from the origin along each axis, and at least _THIN.
-    """
+    """Draws a convex polygon of 3 to 7 corners [n, 2], _THIN to `reach` m from the origin."""
     half = np.maximum(reach * rng.uniform(0.1, 1.0, 2), _THIN)
     if rng.integers(2):
         return half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])

@@ -1,10 +1,8 @@
 """Convex parts, and the mass and inertia of what they make up.
 
-Integrals over a polyhedron are sums over its triangles: each spans a tetrahedron with the origin,
-whose integrals of 1, x and x y are closed forms (Tonon 2005, J. Math. Stat. 1, 8-11).
-
-Products use `einsum`: BLAS, which `@` calls, rounds differently on each kind of processor. A pile
-of falling bodies amplifies a last bit, so machines would settle different piles.
+Integrals over a polyhedron are sums over the tetrahedra of its triangles with the origin (Tonon
+2005, J. Math. Stat. 1, 8-11). Products use `einsum`: BLAS, which `@` calls, rounds differently on
+each kind of processor, and a pile of falling bodies amplifies a last bit.
 """
 
 import dataclasses
@@ -49,15 +47,17 @@ def convex(points: np.ndarray) -> Part:
     sides = np.diff(vertices[triangles], axis=1)  # [T, 2, 3]
     inwards = np.einsum("ti,ti->t", np.cross(*sides.transpose(1, 0, 2)), hull.equations[:, :3]) < 0
     triangles[inwards] = triangles[inwards][:, [0, 2, 1]]
-    planes = _merged(hull.equations * [1, 1, 1, -1], np.ptp(vertices, axis=0).max())
-    return Part(vertices.astype(np.float32), triangles.astype(np.int32), planes)
+    planes = hull.equations * [1, 1, 1, -1]
+    rounded = (planes / [1, 1, 1, np.ptp(vertices, axis=0).max()]).round(_SAME_PLANE)
+    distinct = np.sort(np.unique(rounded, axis=0, return_index=True)[1])
+    vertices, planes = vertices.astype(np.float32), planes[distinct].astype(np.float32)
+    return Part(vertices, triangles.astype(np.int32), planes)
 
 
 def simplified(points: np.ndarray) -> Part:
-    """Builds a hull of some of the points [n, 3] m, with at most MOST_FACES faces.
+    """Builds a hull of at most MOST_FACES faces from the outermost of the points [n, 3] m.
 
-    It begins with the outermost points along axes and diagonals, then adds the one farthest outside
-    while it may. Raises ValueError for points without volume.
+    Raises ValueError for points without volume.
     """
     part = convex(points)
     if len(part.planes) <= MOST_FACES:
@@ -77,13 +77,6 @@ def simplified(points: np.ndarray) -> Part:
 
 
 _DIAGONALS = np.array([*itertools.product((-1.0, 1.0), repeat=3)])
-
-
-def _merged(planes: np.ndarray, size: float) -> np.ndarray:
-    """Keeps one of each plane of the hull's triangles: [T, 4] -> [F, 4]."""
-    rounded = (planes / [1, 1, 1, size]).round(_SAME_PLANE)
-    _, first = np.unique(rounded, axis=0, return_index=True)
-    return planes[np.sort(first)].astype(np.float32)
 
 
 def moments(part: Part) -> Moments:
@@ -111,9 +104,9 @@ def inertia(solid: Moments) -> np.ndarray:
 
 
 def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Computes principal moments [n, 3] of inertias [n, 3, 3] and their axes [n, 3, 3].
+    """Computes principal moments [n, 3] of inertias [n, 3, 3] and their axes, right-handed columns.
 
-    Axes are columns, right-handed. Cyclic Jacobi rotations, Golub and Van Loan, sec. 8.5.
+    Cyclic Jacobi rotations, Golub and Van Loan, sec. 8.5.
     """
     left, axes = np.array(inertia, np.float64), np.tile(np.eye(3), (len(inertia), 1, 1))
     for i, j in 5 * ((0, 1), (0, 2), (1, 2)):
@@ -132,15 +125,7 @@ def principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def moved(part: Part, shift: np.ndarray) -> Part:
     """Shifts a part by `shift` [3] m."""
+    normals, offsets = part.planes[:, :3], part.planes[:, 3]
+    along = offsets + np.einsum("fi,i->f", normals, np.asarray(shift, np.float32))
     vertices = (part.vertices + shift).astype(np.float32)
-    along = np.einsum("fi,i->f", part.planes[:, :3], np.asarray(shift, np.float32))
-    offsets = part.planes[:, 3] + along
-    return Part(vertices, part.triangles, np.column_stack([part.planes[:, :3], offsets]))
-
-
-def narrowest(parts: Iterable[Part]) -> float:
-    """Computes the least distance, m, of a face of the common hull from the corner opposite."""
-    points = np.concatenate([part.vertices for part in parts])
-    hull = ConvexHull(points)
-    along = np.einsum("fi,ni->fn", hull.equations[:, :3], points[hull.vertices])
-    return float(np.ptp(along, axis=1).min())
+    return Part(vertices, part.triangles, np.column_stack([normals, along]))

@@ -14,14 +14,14 @@ from csac_jax.objects.library import Library, LibraryError, Split
 
 CHUNK = 6  # faces, as many as a box has
 NO_FACE = 1e3  # m, offset of a padding face: every point lies inside it
-_MADE = re.compile(r"(made|mixed):(\d{1,9}):(\d{1,4})")
+PROCEDURAL = re.compile(r"procedural(\+assemblies)?:(\d{1,9}):(\d{1,4})")
 
 
 class Tables(NamedTuple):
-    """O objects, P most parts of an object, C most chunks of an object. Object frames.
+    """Fields in object frames. O objects, P most parts of an object, C most chunks of an object.
 
-    A chunk is CHUNK faces of one part; the last chunk of a part is padded. Parts have few faces or
-    many: a table of parts by faces would be mostly empty.
+    A chunk is CHUNK faces of one part, the last one padded: a table of parts by faces would be
+    mostly empty.
     """
 
     normal: np.ndarray  # [O, C, CHUNK, 3] float32 outward unit normals, 0 for padding
@@ -40,21 +40,19 @@ class Tables(NamedTuple):
 
 
 def find(source: str, split: Split) -> Library:
-    """Finds the objects of a split: of the library in the folder `source`, or of our own shapes.
-
-    Those are `procedural:SEED:COUNT`, or `procedural+assemblies:SEED:COUNT` with assemblies.
-    Raises LibraryError.
+    """Finds the objects of a split, of the library in the folder `source` or of our own shapes:
+    `procedural:SEED:COUNT`, `procedural+assemblies:SEED:COUNT`. Raises LibraryError.
     """
-    made = _MADE.fullmatch(source)
-    return _select(_draw(*made.groups()) if made else library.load(Path(source)), split)
+    procedural = PROCEDURAL.fullmatch(source) is not None
+    return _select(_draw(source) if procedural else library.load(Path(source)), split)
 
 
 @functools.lru_cache(maxsize=8)
-def _draw(kind: str, seed: str, count: str) -> Library:
+def _draw(source: str) -> Library:
+    _, seed, count = source.split(":")
     if not 1 <= int(count) <= library.MOST_OBJECTS:
-        most = library.MOST_OBJECTS
-        raise LibraryError(f"{kind}:{seed}:{count}: 1 to {most} objects can be made")
-    draw = shapes.draw if kind == "made" else shapes.draw_mixed
+        raise LibraryError(f"{source}: 1 to {library.MOST_OBJECTS} objects can be made")
+    draw = shapes.draw_mixed if "+" in source else shapes.draw
     return library.from_objects(draw(int(seed), int(count)))
 
 
@@ -70,7 +68,8 @@ def from_library(source: Library) -> Tables:
     present = np.zeros((len(objects), parts), bool)
     for number, member in enumerate(objects):
         present[number, : len(member.parts)] = True
-        middle[number, : len(member.parts)] = [_middle(part.vertices) for part in member.parts]
+        corners = [part.vertices for part in member.parts]
+        middle[number, : len(corners)] = [0.5 * (c.min(axis=0) + c.max(axis=0)) for c in corners]
     rows = [_chunks(member) for member in objects]
     chunks = max(map(len, rows))
     planes = np.full((len(objects), chunks, CHUNK, 4), _NO_PLANE, np.float32)
@@ -101,17 +100,12 @@ _NO_PLANE = np.array([0.0, 0.0, 0.0, NO_FACE], np.float32)
 
 
 def _chunks(member: Object) -> list[tuple[int, np.ndarray]]:
-    """Splits an object's faces into chunks, each with the number of its part."""
-    chunks = []
+    chunks = []  # and the number of the part that each belongs to
     for number, part in enumerate(member.parts):
         missing = -len(part.planes) % CHUNK
         full = np.concatenate([part.planes, np.tile(_NO_PLANE, (missing, 1))])
         chunks += [(number, chunk) for chunk in full.reshape(-1, CHUNK, 4)]
     return chunks
-
-
-def _middle(points: np.ndarray) -> np.ndarray:
-    return 0.5 * (points.min(axis=0) + points.max(axis=0))
 
 
 def _radius(member: Object) -> float:

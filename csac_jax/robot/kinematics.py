@@ -1,9 +1,8 @@
 """UR5 and UR5e in closed form: forward and inverse kinematics of the finger tips.
 
-The arm's base frame is turned by its yaw. The tip frame is the gripper's: between the open finger
-tips, z back to the flange, fingers closing along x. Joint angles [6] rad have the maker's
-order and sense: shoulder pan, shoulder lift, elbow, wrist 1, 2, 3. Sums are written out, since a
-GPU may round matrix products to ten bits.
+The tip frame is the gripper's: between the open finger tips, z back to the flange, fingers closing
+along x. Joint angles [6] rad have the maker's order and sense: shoulder pan, shoulder lift, elbow,
+wrist 1, 2, 3. Sums are written out, since a GPU may round matrix products to ten bits.
 """
 
 import functools
@@ -13,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from csac_jax import grippers
 from csac_jax.config import SimConfig
@@ -33,13 +33,10 @@ class DHParameters(NamedTuple):
     radii: tuple[float, ...]  # of the capsules along `_chain`, pedestal to wrist 2
 
 
-_RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both (ur_description)
-ARMS = {  # sources: scenes/README.md
-    "ur5": DHParameters(
-        0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165, _RADII
-    ),
-    "ur5e": DHParameters(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007, _RADII),
-}
+_RADII = (0.06, 0.06, 0.054, 0.06, 0.04, 0.045, 0.045)  # of both; sources: scenes/README.md
+_UR5 = 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, 0.13585, 0.0165
+_UR5E = 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 0.138, 0.007
+ARMS = {"ur5": DHParameters(*_UR5, _RADII), "ur5e": DHParameters(*_UR5E, _RADII)}
 
 
 class Arm(NamedTuple):
@@ -75,19 +72,19 @@ BRANCHES = np.array(list(itertools.product((1.0, -1.0), repeat=3)), np.float32)
 class TipPose(NamedTuple):
     """Pose of the finger tips, world frame."""
 
-    position: jax.Array  # [3] m
-    rotation: jax.Array  # [3, 3], tip to world
+    position: Array  # [3] m
+    rotation: Array  # [3, 3], tip to world
 
 
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+def _dot(a: Array, b: Array) -> Array:
     return jnp.sum(a * b, axis=-1)
 
 
-def _frames(arm: Arm, q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Array, jax.Array]:
-    """Computes the arm at the joint angles `q` [6], by the maker's parameters, world frame.
+def _frames(arm: Arm, q: Array) -> tuple[list[Array], Array, Array, Array]:
+    """Computes the arm at the joint angles `q` [6]; world frame, [3] each.
 
-    Returns: shoulder, elbow and wrists 1, 2, 3, [3] m each; the axis of joints 2 to 4 [3]; the x
-    axis of the tip frame [3]; the axis of joint 6 [3], from the flange to the tips.
+    Returns: shoulder, elbow and wrists 1, 2, 3, m; the axes of joints 2 to 4, of x of the tip
+    frame, and of joint 6, from the flange to the tips.
     """
     links, (*base, yaw) = arm.links, arm.base
     q = q.at[0].add(yaw)
@@ -110,20 +107,20 @@ def _frames(arm: Arm, q: jax.Array) -> tuple[list[jax.Array], jax.Array, jax.Arr
     return [shoulder, elbow, wrist1, wrist2, wrist3], side, closing, down
 
 
-def forward(arm: Arm, q: jax.Array) -> TipPose:
+def forward(arm: Arm, q: Array) -> TipPose:
     """Returns the pose of the finger tips at the joint angles `q` [6] rad."""
     (*_, wrist3), _, closing, down = _frames(arm, q)
     columns = (closing, jnp.cross(closing, down), -down)
     return TipPose(wrist3 + (arm.links.d6 + arm.tool) * down, jnp.stack(columns, axis=1))
 
 
-def top_down(xyz: jax.Array, yaw: jax.Array) -> TipPose:
+def top_down(xyz: Array, yaw: Array) -> TipPose:
     """Returns the pose of a hand pointing down, tips at `xyz` [3] m, closing along `yaw` [] rad."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return TipPose(xyz, jnp.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]))
 
 
-def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Array, jax.Array]:
+def inverse(arm: Arm, position: Array, rotation: Array) -> tuple[Array, Array]:
     """Solves for the joint angles of all eight branches to a pose of the tips, in closed form.
 
     After Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
@@ -131,9 +128,8 @@ def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Arr
     3e-4. Every step uses the rounded angles of the steps before and so corrects them.
 
     Args: position [3] m; rotation [3, 3], tip to world.
-    Returns: [8, 6] rad in [-pi, pi], order of BRANCHES; [8] bool, False where the pose is out of
-    the branch's reach or within SINGULAR of where two branches meet. Angles are finite but
-    meaningless where it is False.
+    Returns: [8, 6] rad in [-pi, pi], order of BRANCHES, finite; [8] bool, False where the pose is
+    out of the branch's reach or within SINGULAR of where two branches meet.
     """
     unit = jnp.all(jnp.abs(jnp.sum(rotation**2, axis=0) - 1.0) < 0.01)
     sane = jnp.all(jnp.abs(position) < _FAR) & unit  # False for NaN
@@ -143,10 +139,8 @@ def inverse(arm: Arm, position: jax.Array, rotation: jax.Array) -> tuple[jax.Arr
     return joints, valid & sane
 
 
-def _branch(
-    arm: Arm, position: jax.Array, rotation: jax.Array, signs: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Solves one branch, of these `signs` [3]: joint angles [6], and [] bool, they are valid."""
+def _branch(arm: Arm, position: Array, rotation: Array, signs: Array) -> tuple[Array, ...]:
+    """Solves one branch, of these `signs` [3]: joint angles [6], valid [] bool."""
     links, (*base, yaw) = arm.links, arm.base
     x6, y6, down = rotation[:, 0], -rotation[:, 1], -rotation[:, 2]
     from_base = position - jnp.array(base) - (links.d6 + arm.tool) * down  # wrist 3
@@ -167,7 +161,7 @@ def _branch(
     return q - FULL_TURN * jnp.round(q / FULL_TURN), shoulder_ok & elbow_ok & wrist_ok
 
 
-def _shoulder(links: DHParameters, xy: jax.Array, sign: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _shoulder(links: DHParameters, xy: Array, sign: Array) -> tuple[Array, Array]:
     """Solves for the shoulder pan [] with wrist 3 at `xy` [2] m, d4 away from the arm's plane."""
     d4, square = links.d4, _dot(xy, xy)
     ok = square - d4**2 > SINGULAR**2 * square
@@ -176,7 +170,7 @@ def _shoulder(links: DHParameters, xy: jax.Array, sign: jax.Array) -> tuple[jax.
     return towards + 0.5 * np.pi + sign * offset, ok
 
 
-def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[jax.Array, ...]:
+def _wrist(x: Array, y: Array, z: Array, sign: Array) -> tuple[Array, ...]:
     """Solves for wrist 2 and 3 [] from the axis `x` `y` `z` [] of joints 2 to 4, flange frame."""
     square = x**2 + y**2
     ok = square > SINGULAR**2
@@ -184,13 +178,10 @@ def _wrist(x: jax.Array, y: jax.Array, z: jax.Array, sign: jax.Array) -> tuple[j
     return jnp.arctan2(sign * jnp.sqrt(square), z), jnp.arctan2(-sign * y, sign * x), ok
 
 
-def _elbow(
-    links: DHParameters, ahead: jax.Array, up: jax.Array, sign: jax.Array
-) -> tuple[jax.Array, ...]:
-    """Solves for shoulder lift and elbow [] with wrist 1 `ahead` and `up` [] m of the shoulder.
+def _elbow(links: DHParameters, ahead: Array, up: Array, sign: Array) -> tuple[Array, ...]:
+    """Solves for shoulder lift and elbow q3 [] with wrist 1 `ahead` and `up` [] m of the shoulder.
 
-    With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3),
-    cos^2(q3 / 2) = (r^2 - (a2 - a3)^2) / (4 a2 a3).
+    With r the distance: sin^2(q3 / 2) = ((a2 + a3)^2 - r^2) / (4 a2 a3), cos^2 likewise.
     """
     a2, a3, square = links.a2, links.a3, ahead**2 + up**2
     sin2 = ((a2 + a3) ** 2 - square) / (4.0 * a2 * a3)
@@ -208,12 +199,8 @@ _PAIRS = np.array([(i, j) for i, first in enumerate((3, 4, 5, 7, 7)) for j in ra
 _ABOVE_TABLE = slice(2, 8)  # not the hand, whose height is the planner's choice
 
 
-def _chain(arm: Arm, q: jax.Array) -> jax.Array:
-    """Returns points [10, 3] m along the arm; capsules run from each to the next.
-
-    They are pedestal, shoulder, upper arm, elbow, forearm, wrist 1, wrist 2, wrist 3 with the
-    gripper's body, and open fingers. All but the last two are geoms of the arm's MJCF.
-    """
+def _chain(arm: Arm, q: Array) -> Array:
+    """Returns points [10, 3] m along the arm, ends of capsules; the last two are the gripper's."""
     links, (near, far, _) = arm.links, arm.hand_capsule
     (shoulder, elbow, wrist1, wrist2, wrist3), side, _, down = _frames(arm, q)
     foot = jnp.array([arm.base[0], arm.base[1], 0.0])
@@ -223,12 +210,8 @@ def _chain(arm: Arm, q: jax.Array) -> jax.Array:
     return jnp.stack([*points, wrist2, wrist3, palm, tips])
 
 
-def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array) -> jax.Array:
-    """Returns the distance [] m of the segments `p0` `p1` and `q0` `q1` [3] m, neither a point.
-
-    The nearest points of the lines are clipped to one segment, to the other, and back (Ericson,
-    Real-Time Collision Detection, 5.1.9).
-    """
+def _segment_distance(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
+    # Neither segment is a point. Ericson, Real-Time Collision Detection, 5.1.9.
     u, v, w = p1 - p0, q1 - q0, p0 - q0
     uu, uv, vv, uw, vw = _dot(u, u), _dot(u, v), _dot(v, v), _dot(u, w), _dot(v, w)
     cross = uu * vv - uv**2
@@ -240,11 +223,8 @@ def _segment_distance(p0: jax.Array, p1: jax.Array, q0: jax.Array, q1: jax.Array
     return jnp.sqrt(jnp.maximum(_dot(gap, gap), 1e-12))
 
 
-def clearance(arm: Arm, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Returns the least distance [] m at `q` [6] rad from arm to table, and between links.
-
-    The links are capsules, the fingers may touch the table. Negative: they overlap.
-    """
+def clearance(arm: Arm, q: Array) -> tuple[Array, Array]:
+    """Returns the least distances [] m at `q` [6] rad, from arm to table and between links."""
     chain = _chain(arm, q)
     radii = np.array([*arm.links.radii, arm.body_radius, arm.hand_capsule[2]], np.float32)
     start, end = chain[:-1], chain[1:]
@@ -255,47 +235,48 @@ def clearance(arm: Arm, q: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.min(above[_ABOVE_TABLE]), jnp.min(between)
 
 
-def clear(arm: Arm, q: jax.Array) -> jax.Array:
+def clear(arm: Arm, q: Array) -> Array:
     """Returns [] bool, the arm at the joint angles `q` [6] rad avoids the table and itself."""
     to_table, between_links = clearance(arm, q)
     return (to_table > _TABLE_CLEARANCE) & (between_links > _LINK_CLEARANCE)
 
 
-def joint_targets(arm: Arm, q_start: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Follows set-points of the tips with the joints, all on one branch.
+def joint_targets(arm: Arm, q_start: Array, control: Array) -> tuple[Array, Array]:
+    """Follows set-points of the tips on the branch that reaches the most, with the least motion.
 
-    It is the branch that reaches the most set-points; of several, the one with the least motion
-    from `q_start` on. The only jump is the one from `q_start`. The arm stops for good at the first
-    set-point that the branch does not reach, or reaches only through the table or itself.
+    The only jump is the one from `q_start`. The arm stops for good at the first set-point that the
+    branch does not reach, or reaches only through the table or itself.
 
     Args: q_start [6] rad; control [T, 4 or more] as in `primitives.Plan`, for the tip frame.
     Returns: joint angles [T, 6] rad; [] bool, True if the branch reaches every set-point.
     """
-    solutions, valid = _clear_branches(arm, jax.vmap(top_down)(control[:, :3], control[:, 3]))
+    solutions, valid = _clear_branches(arm, control[:, :3], control[:, 3])
     joints, good, motion = jax.vmap(_follow, (None, 1, 1))(q_start, solutions, valid)  # by branch
     reached = jnp.sum(good, axis=1)
     branch = jnp.argmin(jnp.where(reached == jnp.max(reached), motion, jnp.inf))
     return joints[branch], jnp.all(good[branch])
 
 
-def reaches(arm: Arm, tips: jax.Array, yaw: jax.Array) -> jax.Array:
-    """Returns [] bool, one branch reaches all places `tips` [T, 3] m of a hand that points down at
-    `yaw` [] rad, with the arm clear at each. The way between them is not checked."""
-    _, valid = _clear_branches(arm, jax.vmap(top_down, (0, None))(tips, yaw))
+def reaches(arm: Arm, tips: Array, yaw: Array) -> Array:
+    """Returns [] bool, the clear arm reaches all places `tips` [T, 3] m at `yaw` [] on one branch.
+
+    The hand points down. The way between the places is not checked.
+    """
+    _, valid = _clear_branches(arm, tips, jnp.broadcast_to(yaw, len(tips)))
     return jnp.any(jnp.all(valid, axis=0))
 
 
-def _clear_branches(arm: Arm, poses: TipPose) -> tuple[jax.Array, jax.Array]:
-    """Solves for poses, leaves [T, ...]: [T, 8, 6] rad, and [T, 8] bool, valid and clear."""
+def _clear_branches(arm: Arm, tips: Array, yaw: Array) -> tuple[Array, Array]:
+    """Solves for joint angles [T, 8, 6] at tips [T, 3], yaws [T]; [T, 8] bool, valid and clear."""
+    poses = jax.vmap(top_down)(tips, yaw)
     solutions, valid = jax.vmap(functools.partial(inverse, arm))(*poses)
     return solutions, valid & jax.vmap(jax.vmap(functools.partial(clear, arm)))(solutions)
 
 
-def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple[jax.Array, ...]:
+def _follow(q_start: Array, solutions: Array, valid: Array) -> tuple[Array, ...]:
     """Follows one branch [T, 6] rad while it is valid [T] bool, without jumps, within LIMITS.
 
-    Returns: [T, 6] rad, held from the first set-point that fails; [T] bool, good until then; []
-    rad, the sum of all motion.
+    Returns: [T, 6] rad, constant from the first failure; [T] bool, good until then; [] rad moved.
     """
     step = jnp.diff(solutions, axis=0)
     turns = jnp.cumsum(jnp.round(-step / FULL_TURN), axis=0)  # whole, so that no rounding adds up
@@ -304,12 +285,11 @@ def _follow(q_start: jax.Array, solutions: jax.Array, valid: jax.Array) -> tuple
     allowed = valid & jnp.all(jnp.abs(path) <= LIMITS[None], axis=1)
     good = jnp.cumprod(allowed.astype(jnp.int32)).astype(bool)
     last = jnp.maximum(jnp.sum(good) - 1, 0)
-    held = jnp.where(good[0], path[last], q_start)
-    path = jnp.where(good[:, None], path, held[None])
+    path = jnp.where(good[:, None], path, jnp.where(good[0], path[last], q_start)[None])
     return path, good, jnp.sum(jnp.abs(jnp.diff(path, axis=0, prepend=q_start[None])))
 
 
-def _offset(q_start: jax.Array, path: jax.Array, valid: jax.Array) -> jax.Array:
+def _offset(q_start: Array, path: Array, valid: Array) -> Array:
     """Returns whole turns [6] that bring a path [T, 6] rad within LIMITS, near `q_start` [6]."""
     turns = jnp.arange(-2.0, 3.0)[:, None]
     low = jnp.min(jnp.where(valid[:, None], path, jnp.inf), axis=0)[None] + FULL_TURN * turns

@@ -1,10 +1,7 @@
-"""Arms and grippers as MJCF: assembled, and checked against the gripper's numbers.
+"""Robots as MJCF, checked against the gripper's numbers: a hand on four drives, or an arm."""
 
-The robot `hand` moves a gripper through the air on four drives. Any other robot is an arm with the
-gripper at its flange.
-"""
-
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,23 +67,23 @@ def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 def read(path: Path) -> mujoco.MjSpec:
     """Reads an MJCF file. Raises SceneError."""
-    try:
+    with errors_of(path):
         return mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise one_line(path, error) from None
 
 
 def _compile(path: Path) -> mujoco.MjModel:
-    """Compiles a file alone: `attach` silently drops elements that refer to missing ones."""
-    try:
+    """Compiles a file alone: `attach` drops elements that refer to missing ones."""
+    with errors_of(path):
         return mujoco.MjModel.from_xml_path(str(path))
+
+
+@contextlib.contextmanager
+def errors_of(path: Path) -> Iterator[None]:
+    """Turns MuJoCo's errors in the block into SceneErrors of one line with the file."""
+    try:
+        yield
     except ValueError as error:
-        raise one_line(path, error) from None
-
-
-def one_line(path: Path, error: ValueError) -> SceneError:
-    """Formats an error of MuJoCo about a file."""
-    return SceneError(f"{path}: {' '.join(str(error).split())}")
+        raise SceneError(f"{path}: {' '.join(str(error).split())}") from None
 
 
 def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[Any]) -> None:
@@ -98,22 +95,19 @@ def require(path: Path, kind: str, required: Iterable[str], elements: Iterable[A
             raise SceneError(f"{path}: {kind} '{name}' is missing; it has: {has}")
 
 
-def _require_actuators(path: Path, required: Iterable[str], spec: mujoco.MjSpec) -> None:
-    wanted, present = list(required), [actuator.name for actuator in spec.actuators]
-    if present != wanted:
-        names = f"{', '.join(wanted)}, not {', '.join(present)}"
+def _require_actuators(path: Path, required: tuple[str, ...], spec: mujoco.MjSpec) -> None:
+    present = [actuator.name for actuator in spec.actuators]
+    if present != [*required]:
+        names = f"{', '.join(required)}, not {', '.join(present)}"
         raise SceneError(f"{path}: actuators must be {names}")
 
 
 def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) -> None:
-    """Adds the gripper on four drives, which are made for one weight: all grippers get it.
-
-    Visual geoms of its body are left out.
-    """
     root = tool.body(gripper.body)
     for geom in list(root.geoms):
-        if not geom.contype and not geom.conaffinity:
+        if not geom.contype and not geom.conaffinity:  # only visual
             tool.delete(geom)
+    # The drives are made for one weight: all grippers get it.
     root.explicitinertial, root.mass, root.ipos = True, FLOAT_MASS, [0.0, 0.0, FLOAT_COM]
     root.inertia, root.iquat = [FLOAT_INERTIA] * 3, [1.0, 0.0, 0.0, 0.0]
     for drive in FLOAT:
@@ -126,7 +120,6 @@ def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) ->
 
 
 def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
-    """Adds the arm on its base, with a site `tip` for the gripper."""
     path = assets() / f"{sim.robot}.xml"
     arm = read(path)
     require(path, "joint", ARM_JOINTS, arm.joints)
@@ -145,7 +138,6 @@ def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
 
 
 def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
-    """Raises SceneError for MJCF that does not match the gripper's numbers."""
     path = gripper.folder / grippers.MJCF
     require(path, "body", (gripper.body,), tool.bodies)
     require(path, "joint", gripper.joints, tool.joints)
@@ -164,7 +156,6 @@ def _check(tool: mujoco.MjSpec, gripper: Gripper) -> None:
 
 
 def _check_pads(path: Path, model: mujoco.MjModel, gripper: Gripper) -> None:
-    """Raises SceneError for pads that an episode's fingers could not replace."""
     thickness, width, _ = gripper.finger
     for name in gripper.pads:
         pad = model.geom(name)
@@ -175,7 +166,6 @@ def _check_pads(path: Path, model: mujoco.MjModel, gripper: Gripper) -> None:
 
 
 def _require_same(path: Path, what: str, measured: float, wanted: float) -> None:
-    """Raises SceneError for a length in the MJCF, m, that is not that of the numbers."""
     if abs(measured - wanted) > _TOLERANCE:
         by_numbers = f"by {grippers.NUMBERS} {1e3 * wanted:.1f} mm"
         raise SceneError(f"{path}: {what} is {1e3 * measured:.1f} mm, {by_numbers}")

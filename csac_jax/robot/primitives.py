@@ -2,10 +2,10 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax import Array
 
 from csac_jax import geometry, grippers
 from csac_jax.config import HeightmapConfig, SimConfig
@@ -21,21 +21,21 @@ START_GAP = 0.01  # m, between the open hand's tips and what lies under them at 
 class Action:
     """A primitive at a place. `z` follows from the heightmap."""
 
-    primitive: jax.Array  # [] int32, Primitive
-    pose: jax.Array  # [3] x m, y m, yaw rad: a push goes along the yaw, fingers close along it
+    primitive: Array  # [] int32, Primitive
+    pose: Array  # [3] x m, y m, yaw rad: a push goes along the yaw, fingers close along it
 
     @classmethod
-    def grasp(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
+    def grasp(cls, x: Array | float, y: Array | float, yaw: Array | float) -> "Action":
         """Makes a grasp at (x, y) m, closing along `yaw` rad; numbers or arrays [...]."""
         return cls._at(Primitive.GRASP, x, y, yaw)
 
     @classmethod
-    def push(cls, x: jax.Array | float, y: jax.Array | float, yaw: jax.Array | float) -> "Action":
+    def push(cls, x: Array | float, y: Array | float, yaw: Array | float) -> "Action":
         """Makes a push from (x, y) m along `yaw` rad; numbers or arrays [...]."""
         return cls._at(Primitive.PUSH, x, y, yaw)
 
     @classmethod
-    def _at(cls, kind: Primitive, *pose: jax.Array | float) -> "Action":
+    def _at(cls, kind: Primitive, *pose: Array | float) -> "Action":
         parts = jnp.broadcast_arrays(*(jnp.asarray(value, jnp.float32) for value in pose))
         return cls(jnp.full(parts[0].shape, kind, jnp.int32), jnp.stack(parts, axis=-1))
 
@@ -44,21 +44,21 @@ class Action:
 class Plan:
     """Set-points of the hand. T = substeps."""
 
-    control: jax.Array  # [T, 5] x m, y m, z m (finger tips), yaw rad, half the opening m
-    start: jax.Array  # [5] where the hand starts, at rest; same columns
-    surface: jax.Array  # [] m, highest surface in the window about the place
+    control: Array  # [T, 5] x m, y m, z m (finger tips), yaw rad, half the opening m
+    start: Array  # [5] where the hand starts, at rest; same columns
+    surface: Array  # [] m, highest surface in the window about the place
 
 
 @struct.dataclass
 class JointTrajectory:
     """A plan as the robot's joints follow it. Q = joints, U = actuators, T = substeps."""
 
-    start: jax.Array  # [Q] joint positions at rest, order of `World.robot_qpos`
-    control: jax.Array  # [T, U]
-    reachable: jax.Array  # [] bool, False where the robot cannot follow the whole plan
+    start: Array  # [Q] joint positions at rest, order of `World.robot_qpos`
+    control: Array  # [T, U]
+    reachable: Array  # [] bool, False where the robot cannot follow the whole plan
 
 
-def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: Any) -> jax.Array:
+def local_top(cfg: HeightmapConfig, height: Array, xy: Array, side: Any) -> Array:
     """Returns the highest surface [] m of a map [H, W] m in a window of `side` m at `xy` [2] m."""
     distance = jnp.max(jnp.abs(geometry.cell_centres(cfg) - xy[None, None]), axis=-1)
     return jnp.max(jnp.where(distance <= 0.5 * jnp.maximum(side, cfg.cell), height, 0.0))
@@ -67,15 +67,15 @@ def local_top(cfg: HeightmapConfig, height: jax.Array, xy: jax.Array, side: Any)
 def plan(
     cfg: SimConfig,
     heightmap: HeightmapConfig,
-    height: jax.Array,
+    height: Array,
     action: Action,
     fingers: Fingers | None = None,
 ) -> Plan:
     """Plans the set-points of a primitive, one of VPG's two (arXiv:1803.09956).
 
     Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
-    down with closed fingers to `push_depth` below the surface, then `push_length` along the yaw,
-    the end clipped to the workspace, then lift. `fingers` default to the gripper's.
+    down with closed fingers to `push_depth`, then `push_length` along the yaw, or to the border of
+    the workspace, then lift. `fingers` default to the gripper's.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
@@ -89,7 +89,6 @@ def plan(
     end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
     closed = gripper.half[0]
     opening = jnp.where(is_grasp, 0.5 * fingers.opening, closed)
-
     phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
@@ -100,12 +99,9 @@ def plan(
 
 
 def reachable(
-    cfg: SimConfig, heightmap: HeightmapConfig, primitive: jax.Array, xy: jax.Array, yaw: jax.Array
-) -> jax.Array:
-    """Returns [] bool, the robot reaches both ends of a primitive [] at `xy` [2] m.
-
-    The height is not known yet: both the lowest and that over a block must be in reach.
-    """
+    cfg: SimConfig, heightmap: HeightmapConfig, primitive: Array, xy: Array, yaw: Array
+) -> Array:
+    """Returns [] bool, a primitive [] at `xy` [2] m is in reach, on the table and above a block."""
     if cfg.robot == "hand":
         return jnp.ones((), bool)
     low, is_push = lowest(cfg, grippers.load(cfg.gripper)), primitive == Primitive.PUSH
@@ -114,10 +110,7 @@ def reachable(
     return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
 
 
-def _push_end(
-    cfg: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaw: jax.Array
-) -> jax.Array:
-    """Returns the end [2] m of a push from `xy` [2] m."""
+def _push_end(cfg: SimConfig, heightmap: HeightmapConfig, xy: Array, yaw: Array) -> Array:
     direction, limit = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]), 0.5 * heightmap.extent
     return jnp.clip(xy + cfg.push_length * direction, -limit, limit)
 
@@ -133,22 +126,18 @@ def lowest(cfg: SimConfig, gripper: Gripper) -> float:
 
 
 def _progress(phases: tuple[int, int, int]) -> np.ndarray:
-    """Returns the progress of each phase, 0 to 1, at every substep, [3, T].
-
-    The last phase, the lift, is smooth: a jerk shakes blocks loose.
-    """
+    """Returns the progress of each phase, 0 to 1, at every substep, [3, T]."""
     times, lengths = np.arange(1, sum(phases) + 1), np.array(phases)[:, None]
     starts = np.cumsum(lengths, axis=0) - lengths
     linear = np.clip((times - starts) / lengths, 0, 1)
-    linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])
+    linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])  # a jerky lift shakes blocks loose
     return linear.astype(np.float32)
 
 
 def joint_trajectory(cfg: SimConfig, plan: Plan) -> JointTrajectory:
     """Converts a plan to joint set-points: as they are for the hand, by an arm's inverse.
 
-    The robot moves the tip frame of the open hand. Tips that close on an arc get lower; the hand
-    rises by as much, so that the tips stay where the plan has them.
+    Tips that close on an arc get lower: the hand rises by as much.
     """
     gripper = grippers.load(cfg.gripper)
     control = jnp.concatenate([plan.start[None], plan.control])

@@ -4,22 +4,24 @@
         {"shape": "cube", "colour": "red", "position": [0.03, 0, 0.025],
          "quaternion": [1, 0, 0, 0], "target": true}, ...]}
 
-An object of a library has `"object": "NAME", "library": "LIB"` in place of a shape. LIB is a folder
-relative to that of the file, or procedural:SEED:COUNT, or procedural+assemblies:SEED:COUNT. A
-position is that of the centre of the bounding box, m. A quaternion (w, x, y, z) is normalised.
+An object of a library has `"object": "NAME", "library": "LIB"` in place of a shape; see
+`tables.find`, folders are relative to that of the file. A position is that of the centre of the
+bounding box, m. A quaternion (w, x, y, z) is normalised.
 """
 
 import json
+import re
 from collections import Counter
 from typing import Annotated, Any, Literal, Self
 
 import pydantic
 from pydantic import BaseModel, Field
 
-from csac_jax import config
+from csac_jax.config import shown
+from csac_jax.errors import first_fault
 from csac_jax.world import blocks
 
-_NO_VALUE = {"missing": "is missing", "extra_forbidden": "is not a key of a case file"}
+_BLOCK = re.compile(r"'blocks\.(\d+)(' |\.)")  # in a fault: a block, or a key of it
 _Shape: Any = Literal[tuple(blocks.SHAPES)]
 _Colour: Any = Literal[blocks.COLOUR_NAMES]
 _Number = Annotated[float, Field(ge=-10, le=10)]  # more than any place needs; no NaN
@@ -27,7 +29,7 @@ _PRINTABLE = r"^[^\p{C}\p{Zl}\p{Zp}]*$"
 _Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
-class Entry(BaseModel, extra="forbid", strict=True):
+class CaseBlock(BaseModel, extra="forbid", strict=True):
     """A block of the set, or an object of a library, at its place."""
 
     shape: _Shape | None = None
@@ -52,33 +54,26 @@ class CaseFile(BaseModel, extra="forbid", strict=True):
     """All of a case file."""
 
     name: Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
-    blocks: Annotated[list[Entry], Field(min_length=1, max_length=32)]
+    blocks: Annotated[list[CaseBlock], Field(min_length=1, max_length=32)]
 
 
 def parse(text: str) -> CaseFile:
     """Parses a case file. Raises ValueError, one line with the block (the first is 1) and key."""
     try:
         return CaseFile.model_validate(json.loads(text, object_pairs_hook=_unique))
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"is not a JSON file: {error}") from None
     except pydantic.ValidationError as error:
-        raise ValueError(_one_line(error.errors(include_url=False)[0])) from None
+        raise ValueError(_BLOCK.sub(_block, first_fault(error))) from None
 
 
-def _one_line(error: Any) -> str:
-    keys, message = [*error["loc"]], error["msg"].removeprefix("Value error, ")
-    block = f"block {keys[1] + 1}: " if len(keys) > 1 else ""
-    key = ".".join(map(str, keys[2:] if block else keys))
-    if error["type"] in _NO_VALUE:
-        message = _NO_VALUE[error["type"]]
-    elif key or not isinstance(error["input"], dict):
-        message += f", not {config.shown(error['input'])}"
-    return f"{block}{config.shown(key) + ': ' if key else ''}{message}"
+def _block(match: re.Match) -> str:
+    quote = "'" if match[2] == "." else ""
+    return f"block {int(match[1]) + 1}: {quote}"
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Builds an object of JSON. Raises ValueError for a key given twice."""
     for key, number in Counter(key for key, _ in pairs).items():
         if number > 1:
-            raise ValueError(f"key {config.shown(key)} is given twice in one object; remove one")
+            raise ValueError(f"key {shown(key)} is given twice in one object; remove one")
     return dict(pairs)

@@ -1,7 +1,4 @@
-"""Case files: arrangements written by hand, shipped in `scenes/cases/` or brought by the user.
-
-`case_file` describes the format. Sizes, densities and frictions are nominal.
-"""
+"""Case files, see `case_file`: arrangements written by hand, of nominal sizes and materials."""
 
 import itertools
 from pathlib import Path
@@ -20,7 +17,7 @@ from csac_jax.world import blocks, object_slots, scene_state
 from csac_jax.world.scene_state import SceneState
 
 if TYPE_CHECKING:
-    from csac_jax.scenes.case_file import CaseFile, Entry
+    from csac_jax.scenes.case_file import CaseBlock, CaseFile
 
 MAX_OVERLAP = 0.002  # m, between two blocks or with the table
 _HIGHEST = 0.5  # m, that any part of a block may reach
@@ -49,10 +46,8 @@ def shipped(name: str) -> Path:
 
 
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
-    """Loads a case whose blocks lie inside the square of side `extent` m.
-
-    Raises ValueError, one line with the file, the block (the first is 1) and what to change.
-    """
+    """Loads a case whose blocks lie inside the square of side `extent` m. Raises ValueError, one
+    line with the file, the block (the first is 1) and what to change."""
     from csac_jax.scenes import case_file
 
     try:
@@ -60,10 +55,8 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
         _check_places(case, extent)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
-    except (ValueError, LibraryError) as error:
+    except (ValueError, LibraryError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
-    except RecursionError:
-        raise ValueError(f"{path}: is nested too deeply for a case file") from None
     return case
 
 
@@ -89,22 +82,20 @@ def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:
 
 
 def _case(content: "CaseFile", folder: Path) -> Case:
-    """Builds the case of a file in this folder; `_check_places` must follow."""
     entries = content.blocks
     targets = [slot for slot, entry in enumerate(entries) if entry.target]
     if len(targets) > 1:
         first, second = targets[0] + 1, targets[1] + 1
         raise ValueError(f"block {second}: block {first} is the target already; mark only one")
+    unknown = blocks.Shape("object", blocks.OBJECT_HALF)
+    shapes = [blocks.SHAPES[entry.shape] if entry.shape else unknown for entry in entries]
+    slots = tuple(shape.kind for shape in shapes)
     quaternions = [np.array(entry.quaternion) for entry in entries]
-    shapes = [blocks.SHAPES[entry.shape] if entry.shape else None for entry in entries]
-    slots: tuple[SlotKind, ...] = tuple(shape.kind if shape else "object" for shape in shapes)
-    half_size = [shape.half_size if shape else blocks.OBJECT_HALF for shape in shapes]
-    colour = [blocks.COLOUR_NAMES.index(entry.colour) for entry in entries]
     scene = scene_state.parked(slots).replace(
         position=np.array([entry.position for entry in entries], np.float32),
         quaternion=np.array([q / np.linalg.norm(q) for q in quaternions], np.float32),
-        half_size=np.array(half_size, np.float32),
-        colour=np.array(colour, np.int32),
+        half_size=np.array([shape.half_size for shape in shapes], np.float32),
+        colour=np.array([blocks.COLOUR_NAMES.index(entry.colour) for entry in entries], np.int32),
         in_play=np.ones(len(slots), bool),
         target=np.int32(targets[0] if targets else scene_state.ANY),
     )
@@ -112,13 +103,11 @@ def _case(content: "CaseFile", folder: Path) -> Case:
     return _with_objects(case, entries, folder) if "object" in slots else case
 
 
-def _with_objects(case: Case, entries: list["Entry"], folder: Path) -> Case:
-    """Puts the objects that the entries name into a case."""
-    libraries = {entry.library for entry in entries if entry.library}
-    if len(libraries) > 1:
-        raise ValueError(f"objects of {len(libraries)} libraries; take all from one")
-    (name,) = libraries
-    source = name if name.startswith(("made:", "mixed:")) else str(folder / name)
+def _with_objects(case: Case, entries: list["CaseBlock"], folder: Path) -> Case:
+    name, *others = {entry.library for entry in entries if entry.library}
+    if others:
+        raise ValueError(f"objects of {1 + len(others)} libraries; take all from one")
+    source = name if tables.PROCEDURAL.fullmatch(name) else str(folder / name)
     library, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
     numbers = np.array([library.number(entries[slot].object or "") for slot in slots])
     objects = tables.from_library(library)
@@ -131,7 +120,6 @@ def _with_objects(case: Case, entries: list["Entry"], folder: Path) -> Case:
 
 
 def _check_places(case: Case, extent: float) -> None:
-    """Raises ValueError for blocks that overlap, or one outside the square or in the table."""
     placed: list[list[np.ndarray]] = []  # corners of the parts of the blocks so far
     for number, parts in enumerate(_corners(case), 1):
         fault = _outside(np.concatenate(parts), extent) or _overlapping(parts, placed)
@@ -141,7 +129,7 @@ def _check_places(case: Case, extent: float) -> None:
 
 
 def _corners(case: Case) -> list[list[np.ndarray]]:
-    """Computes the corners [V, 3] m in the world of every part of every block."""
+    """Computes corners [V, 3] m in the world of every part of every block."""
     scene, cube = case.scene, np.array([*itertools.product((-1.0, 1.0), repeat=3)])
     rotations = Rotation.from_quat(scene.quaternion, scalar_first=True)
     corners: list[list[np.ndarray]] = [[] for _ in case.slots]
@@ -161,7 +149,6 @@ def _corners(case: Case) -> list[list[np.ndarray]]:
 
 
 def _outside(corners: np.ndarray, extent: float) -> str | None:
-    """Describes how far corners [V, 3] m of a block lie outside of the allowed volume."""
     beyond = np.abs(corners[:, :2]).max() - 0.5 * extent
     below, top = -corners[:, 2].min(), corners[:, 2].max()
     if beyond > _ROUNDING:
@@ -174,7 +161,6 @@ def _outside(corners: np.ndarray, extent: float) -> str | None:
 
 
 def _overlapping(parts: list[np.ndarray], placed: list[list[np.ndarray]]) -> str | None:
-    """Describes the overlap of a block's parts with those of one placed before."""
     for number, others in enumerate(placed, 1):
         depth = max(overlap(*pair) for pair in itertools.product(parts, others))
         if depth > MAX_OVERLAP:
@@ -186,8 +172,7 @@ def _overlapping(parts: list[np.ndarray], placed: list[list[np.ndarray]]) -> str
 def overlap(one: np.ndarray, two: np.ndarray) -> float:
     """Computes the shortest shift, m, that separates convex bodies of corners [V, 3] m.
 
-    It is <= 0 for bodies apart. It is the depth of the origin in their Minkowski difference.
-    Contacts of C MuJoCo give the same, but none for two meshes in one place.
+    It is the depth of the origin in their Minkowski difference, <= 0 for bodies apart.
     """
     difference = (one[:, None] - two[None]).reshape(-1, 3)
     return -float(ConvexHull(difference).equations[:, 3].max())

@@ -1,8 +1,8 @@
 """Families of packed arrangements: each is an ordered list of roles and their places.
 
-Each role takes a random free slot of its kinds. The shipped cases are held out by construction: a
-family packs at most one arch, `row`, `pinwheel` and `hole` two; at most one prism, `ridge` two. No
-family is a row, a ridge, a ring or a nest. R = the 5 roles, N = block slots.
+Each role takes a random free slot of its kinds. The shipped cases are held out by construction:
+no family is a row, a ridge, a ring or a nest, or packs two arches, as `row`, `pinwheel` and `hole`
+do, or two prisms, as `ridge`. R = the 5 roles, N = block slots.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from csac_jax.config import MESH_KINDS, SlotKind
 from csac_jax.errors import SceneError
@@ -37,11 +38,11 @@ class Role(NamedTuple):
 class Placed(NamedTuple):
     """Places of a family's blocks, before the arrangement is rotated and shifted as a whole."""
 
-    xy: jax.Array  # [R, 2] m
-    crosswise: jax.Array  # [R] bool, rotated by a quarter turn about z
-    target: jax.Array  # [] int32, role of the block that is hardest to reach
-    floor: jax.Array | float = 0.0  # [R] m, height of the surface that carries the block
-    yaw: jax.Array | float = 0.0  # [R] rad, in addition to the quarter turn
+    xy: Array  # [R, 2] m
+    crosswise: Array  # [R] bool, rotated by a quarter turn about z
+    target: Array  # [] int32, role of the block that is hardest to reach
+    floor: Array | float = 0.0  # [R] m, height of the surface that carries the block
+    yaw: Array | float = 0.0  # [R] rad, in addition to the quarter turn
 
 
 class Family(NamedTuple):
@@ -50,21 +51,21 @@ class Family(NamedTuple):
     roles: tuple[Role, Role, Role, Role, Role]
     needed: int  # the first so many roles make the arrangement; the others may be left out
     # From draws, half extents [R, 3] m as the blocks lie, used [R] bool and gap [] m:
-    place: Callable[["Draws", jax.Array, jax.Array, jax.Array], Placed]
+    place: Callable[["Draws", Array, Array, Array], Placed]
     # Half sizes [R, 3] m of blocks that fit, from those drawn:
-    resize: Callable[[jax.Array], jax.Array] = lambda half: half
+    resize: Callable[[Array], Array] = lambda half: half
 
 
 class Draws(NamedTuple):
     """The randomness of a packing, uniform; the same draws serve every family."""
 
-    preference: jax.Array  # [N] 0..1, slots with more are taken first
-    optional: jax.Array  # [] 0..1, how many optional roles are used
-    gap: jax.Array  # [] 0..1
-    on_side: jax.Array  # [R] 0..1
-    order: jax.Array  # [R] 0..1, along a line
-    crosswise: jax.Array  # [R] bool
-    jitter: jax.Array  # [R, 2] -1..1
+    preference: Array  # [N] 0..1, slots with more are taken first
+    optional: Array  # [] 0..1, how many optional roles are used
+    gap: Array  # [] 0..1
+    on_side: Array  # [R] 0..1
+    order: Array  # [R] 0..1, along a line
+    crosswise: Array  # [R] bool
+    jitter: Array  # [R, 2] -1..1
 
 
 def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
@@ -76,9 +77,8 @@ def available(slots: tuple[SlotKind, ...]) -> dict[str, Family]:
 
 
 def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
-    """Tests if every needed role gets a slot. Roles of fewer kinds are first: greedy is exact."""
     free = list(slots)
-    for role in family.roles[: family.needed]:
+    for role in family.roles[: family.needed]:  # roles of fewer kinds are first: greedy is exact
         fitting = [kind for kind in free if kind in role.kinds]
         if not fitting:
             return False
@@ -86,30 +86,20 @@ def _is_possible(family: Family, slots: tuple[SlotKind, ...]) -> bool:
     return True
 
 
-def draw(key: jax.Array, num_slots: int) -> Draws:
+def draw(key: Array, num_slots: int) -> Draws:
     """Draws all noise of a packing in one call of the generator: each call is slow to compile."""
     noise = jax.random.uniform(key, (num_slots + 2 + 5 * ROLES,))
     preference, (optional, gap), roles = jnp.split(noise, [num_slots, num_slots + 2])
-    roles = roles.reshape(5, ROLES)
-    return Draws(
-        preference=preference,
-        optional=optional,
-        gap=gap,
-        on_side=roles[0],
-        order=roles[1],
-        crosswise=roles[2] < 0.5,
-        jitter=2.0 * roles[3:].T - 1.0,
-    )
+    on_side, order, crosswise, *jitter = roles.reshape(5, ROLES)
+    offsets = 2.0 * jnp.stack(jitter, axis=1) - 1.0
+    return Draws(preference, optional, gap, on_side, order, crosswise < 0.5, offsets)
 
 
-def _half_xy(half: jax.Array, crosswise: jax.Array) -> jax.Array:
-    """Returns half extents [R, 2] m along x and y; crosswise [R] bool."""
+def _half_xy(half: Array, crosswise: Array) -> Array:
     return jnp.where(crosswise[:, None], half[:, 1::-1], half[:, :2])
 
 
-def _line(
-    noise: jax.Array, width: jax.Array, used: jax.Array, gap: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _line(noise: Array, width: Array, used: Array, gap: Array) -> tuple[Array, Array]:
     """Computes centres [R] m about 0 of blocks along a line, and the number of the middle one [].
 
     Args: noise [R] orders the blocks; width [R] m, half widths.
@@ -124,13 +114,12 @@ def _line(
     return start + 0.5 * (step - jnp.sum(step)), jnp.argmax(is_middle).astype(jnp.int32)
 
 
-def _by_gap(ends: tuple[float, float], gap: jax.Array) -> jax.Array:
-    """Interpolates [] between the ends for touching blocks and for blocks WIDE_GAP apart."""
+def _by_gap(ends: tuple[float, float], gap: Array) -> Array:
     touching, wide = (np.float32(end) for end in ends)
     return touching + (wide - touching) * gap / np.float32(WIDE_GAP)
 
 
-def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_wall(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two like bricks end to end, a block across their joint, one along each face."""
     crosswise = draws.crosswise & _is_role(3, 4)
     half_xy, joint = _half_xy(half, crosswise), jnp.minimum(gap, STACKED_GAP)
@@ -142,14 +131,14 @@ def _place_wall(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) 
     return _stacked(x, y, crosswise, draws, {2: 2.0 * half[0, 2]}, target=0)
 
 
-def _place_stairs(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_stairs(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two flights of stairs: each block begins farther along than its inner neighbour."""
     y, middle = _line(draws.order, half[:, 1], used, gap)
     slant = _by_gap(SLANTS, gap)
     return Placed(jnp.stack([slant * jnp.abs(y), y], axis=1), jnp.zeros_like(used), middle)
 
 
-def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_fan(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places the ribs of a fan: each points away from one place, as near as neighbours allow."""
     between = _by_gap(FAN_ANGLES, gap)
     sin, cos = jnp.sin(0.5 * between), jnp.cos(0.5 * between)
@@ -162,7 +151,7 @@ def _place_fan(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -
     return Placed(xy, jnp.zeros_like(used), middle, yaw=jnp.asarray(angle))
 
 
-def _place_bridge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_bridge(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two like piers, a deck from one to the other, a block along each side."""
     crosswise = _is_role(0, 1)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
@@ -173,7 +162,7 @@ def _place_bridge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array
     return _stacked(x, y, crosswise, draws, {2: 2.0 * half[0, 2]}, target=2)
 
 
-def _place_tower(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_tower(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places three blocks on one another, crosswise in turn, and one at either end."""
     crosswise = _is_role(1)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
@@ -183,13 +172,13 @@ def _place_tower(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array)
     return _stacked(x, jnp.zeros_like(x), crosswise, draws, floors, target=1)
 
 
-def _place_wedge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_wedge(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two blocks in a V, one between them, one behind the tip, one along the outside."""
     sin, cos = np.float32(np.sin(WEDGE_ANGLE)), np.float32(np.cos(WEDGE_ANGLE))
     along, out = np.array([cos, sin]), np.array([-sin, cos])
     mirror = np.array([1.0, -1.0], np.float32)
 
-    def arm(role: int, beyond: jax.Array) -> jax.Array:
+    def arm(role: int, beyond: Array) -> Array:
         return (0.5 * gap / sin + half[role, 0]) * along + (beyond + half[role, 1]) * out
 
     zero = jnp.zeros_like(gap)
@@ -203,20 +192,17 @@ def _place_wedge(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array)
     return Placed(xy, jnp.zeros_like(used), jnp.int32(2), yaw=jnp.asarray(yaw))
 
 
-def _place_corner(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_corner(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places two blocks in an L, one in its corner, one beyond that along either leg."""
     crosswise = _is_role(1)
     leg, high = _half_xy(half, crosswise)[1], jnp.maximum(half[2, 1], half[3, 1])
-    x = jnp.stack(
-        [half[0, 0], -gap - leg[0], half[2, 0], 2.0 * half[2, 0] + gap + half[3, 0], half[4, 0]]
-    )
-    y = jnp.stack(
-        [-half[0, 1], leg[1], gap + half[2, 1], gap + half[3, 1], 2.0 * (gap + high) + half[4, 1]]
-    )
+    beyond = 2.0 * half[2, 0] + gap + half[3, 0], 2.0 * (gap + high) + half[4, 1]
+    x = jnp.stack([half[0, 0], -gap - leg[0], half[2, 0], beyond[0], half[4, 0]])
+    y = jnp.stack([-half[0, 1], leg[1], gap + half[2, 1], gap + half[3, 1], beyond[1]])
     return Placed(jnp.stack([x, y], axis=1), crosswise, jnp.int32(2))
 
 
-def _place_bin(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -> Placed:
+def _place_bin(draws: Draws, half: Array, used: Array, gap: Array) -> Placed:
     """Places a back and two sides, open in front, a block inside, and one behind the back."""
     crosswise = _is_role(1, 2)
     half_xy, zero = _half_xy(half, crosswise), jnp.zeros_like(gap)
@@ -227,18 +213,12 @@ def _place_bin(draws: Draws, half: jax.Array, used: jax.Array, gap: jax.Array) -
     return Placed(jnp.stack([x, y], axis=1), crosswise, jnp.int32(3))
 
 
-def _is_role(*numbers: int) -> jax.Array:
-    """Returns [R] bool, True at these roles."""
+def _is_role(*numbers: int) -> Array:
     return jnp.asarray(np.isin(np.arange(ROLES), numbers))
 
 
 def _stacked(
-    x: jax.Array,
-    y: jax.Array,
-    crosswise: jax.Array,
-    draws: Draws,
-    floors: dict[int, jax.Array],
-    target: int,
+    x: Array, y: Array, crosswise: Array, draws: Draws, floors: dict[int, Array], target: int
 ) -> Placed:
     """Places blocks at x, y [R] m; those on a floor [] m above the table get a random offset."""
     floor = jnp.stack([floors.get(role, jnp.zeros_like(x[0])) for role in range(ROLES)])
@@ -246,9 +226,8 @@ def _stacked(
     return Placed(jnp.stack([x, y], axis=1) + offset, crosswise, jnp.int32(target), floor)
 
 
-def _second_like_first(half: jax.Array) -> jax.Array:
-    """Copies the size of the first block to the second, so that a block across both lies flat."""
-    return half.at[1].set(half[0])
+def _second_like_first(half: Array) -> Array:
+    return half.at[1].set(half[0])  # so that a block across both lies flat
 
 
 _NO_PRISM: tuple[SlotKind, ...] = ("box", "half_cylinder", "cylinder")

@@ -2,7 +2,7 @@
 
 C MuJoCo settles dropped blocks on all cores, bit-identical for any number of threads. Scenes are
 cached on disk; those of the preset `quick` come with the package. `stream` numbers the stream of
-random numbers: training takes 0, evaluation others.
+random numbers.
 """
 
 import contextlib
@@ -30,11 +30,11 @@ from csac_jax.world import blocks, model, object_slots, scene_state
 from csac_jax.world.model import BlockFields, World
 from csac_jax.world.scene_state import SceneState
 
-TRAIN_STREAM = 0
+TRAIN_STREAM = 0  # evaluation takes others
 _VERSION = 5  # raise when the meaning of a cached pool changes
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
-_MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly a scene stays in the workspace
+_MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly any stay in the workspace
 _PAUSE = 0.2  # s between blocks that are poured: a fall from drop_height takes 0.17 s
 _PIN_EVERY = 10  # steps after which blocks that wait to be poured are put back
 _DRAWS = 20  # of objects, for which there must be room side by side
@@ -47,12 +47,11 @@ Fall = Callable[[SceneState, BlockFields], SceneState | None]
 
 
 def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
-    """Returns at least `count` scenes at rest, as many of each number of blocks.
+    """Returns at least `count` scenes at rest, as many of each number of blocks, [P, N, ...].
 
-    NumPy leaves [P, N, ...]. The last `scene.packed_fraction` of them are arrangements, or objects
-    of a library side by side in the largest square of `scene.drop_extent`. Without a count,
-    `scene.pool` of each number of blocks. Raises SceneError for blocks that do not come to rest or
-    allow no arrangement.
+    The last `scene.packed_fraction` of them are arrangements, or objects side by side in the
+    largest square of `scene.drop_extent`. Without a count, `scene.pool` of each number of blocks.
+    Raises SceneError for blocks that do not come to rest or allow no arrangement.
     """
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     number = cfg.scene.pool if count is None else -(-count // block_counts)
@@ -73,12 +72,11 @@ def settled(
 ) -> SceneState:
     """Returns `count` distinct settled scenes for each number of blocks from `min_blocks` to N.
 
-    NumPy leaves [P, N, ...], fewest blocks first; the same for the same arguments on every machine
-    of one kind. Every block in play is at rest, its centre within extent / 2 of the workspace
-    centre, so a scene can be rotated by any yaw. Up to 12 blocks drop all at once, stacked in the
-    air. More, or all if `poured`, drop one after another, from `drop_height` above the pile; one
-    that rolls off drops again. If `packed`, objects stand on the table, see `stock.packed`.
-    Logs its progress. Raises SceneError where hardly any scene comes to rest.
+    NumPy leaves [P, N, ...], fewest blocks first; the same on every machine of one kind. Centres of
+    blocks in play lie within extent / 2 of the workspace's, so a scene can be rotated by any yaw.
+    Up to 12 blocks drop all at once. More, or all if `poured`, drop one after another; one that
+    rolls off drops again. If `packed`, objects stand on the table, see `object_slots.packed`.
+    Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, packed_fraction=0.0)
 
@@ -91,7 +89,7 @@ def settled(
         for number in numbers:
             drop = functools.partial(_stand if packed else _drop, scene, rng, number)
             pouring = poured or (number > _MOST_DROPPED and not packed)
-            fall = functools.partial(pour if pouring else rest, world, scene, cfg.heightmap.extent)
+            fall = functools.partial(pour if pouring else rest, world, cfg)
             for fallen in _settle(world, drop, fall, count, costly=pouring or packed):
                 done.append(fallen)
                 if time.monotonic() - logged_at >= _LOGGED_EVERY:
@@ -108,24 +106,17 @@ def settled(
 def _stored(digest: str, make: Callable[[], SceneState]) -> SceneState:
     """Returns the scenes of that digest: shipped, cached, or made now and cached."""
     name, cache = f"{digest}.npz", cache_folder.private("pools")
-    path = cache and cache / name
-    for file in (shipped() / name, path):
-        if file and (stored := _read(file)) is not None:
+    for folder in (shipped(), cache):
+        if folder and (stored := _read(folder / name)) is not None:
             return stored
-    with _on_host():
+    with contextlib.ExitStack() as stack:
+        # A GPU adds a block's parts in any order: scenes would differ between processes.
+        with contextlib.suppress(RuntimeError):  # JAX_PLATFORMS names no CPU
+            stack.enter_context(jax.default_device(jax.local_devices(backend="cpu")[0]))
         made = make()
-    if path:
-        _write(path, made)
+    if cache:
+        _write(cache / name, made)
     return made
-
-
-def _on_host() -> contextlib.AbstractContextManager[Any]:
-    """Makes JAX compute on the CPU if it may: a GPU adds a block's parts in any order, so scenes
-    would differ between processes."""
-    try:
-        return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:  # JAX_PLATFORMS names no CPU
-        return contextlib.nullcontext()
 
 
 def _settle(
@@ -139,7 +130,7 @@ def _settle(
         drops = [drop() for _ in range(num)]
         fields = jax.device_get(fields_of(_stack(drops)))
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], fields) for i in range(num)]
-        for scene in _first_at_rest(fall, list(zip(drops, rows, strict=True)), missing):
+        for scene in _first_at_rest(fall, drops, rows, missing):
             missing -= 1
             yield scene
         dropped += num
@@ -149,18 +140,16 @@ def _settle(
             raise SceneError(f"{settled} in the workspace; {remedy}")
 
 
-def _first_at_rest(
-    fall: Fall, drops: list[tuple[SceneState, BlockFields]], count: int
-) -> Iterator[SceneState]:
-    """Yields the first `count` of these scenes that come to rest, in order; few others fall."""
+def _first_at_rest(fall: Fall, drops: list, fields: list, count: int) -> Iterator[SceneState]:
+    """Yields the first `count` of these scenes that come to rest; few others fall."""
     with ThreadPoolExecutor() as threads:
         while drops and count:
             some = max(count, len(os.sched_getaffinity(0)))
-            fallen, drops = threads.map(fall, *zip(*drops[:some], strict=True)), drops[some:]
-            for scene in fallen:
+            for scene in threads.map(fall, drops[:some], fields[:some]):
                 if scene is not None and count:
                     count -= 1
                     yield scene
+            drops, fields = drops[some:], fields[some:]
 
 
 def _stack(scenes: list[SceneState]) -> SceneState:
@@ -202,7 +191,6 @@ def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> SceneState
 
 
 def _falling(world: World, scene: SceneState, fields: BlockFields) -> mujoco.MjData:
-    """Builds the model and state of one scene, the hand high above."""
     exact = model.with_blocks(world, fields)
     exact.opt.iterations, exact.opt.ls_iterations = 20, 20  # quality over speed: this runs once
     # Pools of objects, in caches and digests, were settled with friction pyramids.
@@ -214,36 +202,30 @@ def _falling(world: World, scene: SceneState, fields: BlockFields) -> mujoco.MjD
     return data
 
 
-def rest(
-    world: World, cfg: SceneConfig, extent: float, scene: SceneState, fields: BlockFields
-) -> SceneState | None:
+def rest(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> SceneState | None:
     """Drops all blocks; None if one is not at rest then or left the workspace."""
     data = _falling(world, scene, fields)
     data.model.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0
-    mujoco.mj_step(data.model, data, nstep=round(cfg.settle_time / data.model.opt.timestep))
-    return _at_rest(world, extent, scene, data)
+    mujoco.mj_step(data.model, data, nstep=round(cfg.scene.settle_time / data.model.opt.timestep))
+    return _rested(world, cfg, scene, data)
 
 
-def pour(
-    world: World, cfg: SceneConfig, extent: float, scene: SceneState, fields: BlockFields
-) -> SceneState | None:
+def pour(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> SceneState | None:
     """Drops blocks one after another, lowest first; those that roll off, again. See `rest`."""
     data = _falling(world, scene, fields)
     num, pause = len(scene.in_play), round(_PAUSE / data.model.opt.timestep)
     waiting = [int(slot) for slot in np.argsort(scene.position[:, 2]) if scene.in_play[slot]]
     rng = np.random.default_rng(np.abs(scene.position * 1e6).astype(np.uint64).ravel())
-    half = 0.5 * rng.uniform(*cfg.drop_extent)
+    half = 0.5 * rng.uniform(*cfg.scene.drop_extent)
     pinned = np.ones(num, bool)  # waiting in the air
-    places, quiet = scene_state.parking(num), 0.0
-
-    still = round(cfg.settle_time / _PAUSE)
+    places, quiet, still = scene_state.parking(num), 0.0, round(cfg.scene.settle_time / _PAUSE)
     for _ in range(max(_MAX_PAUSES * len(waiting), 2 * len(waiting) + still)):
         if waiting:
             slot = waiting.pop(0)
             top = data.qpos[world.block_qpos[~pinned, 2]].max(initial=0.0)
             pinned[slot], quiet = False, 0.0
             xy = rng.uniform(-half, half, 2)
-            data.qpos[world.block_qpos[slot, :3]] = [*xy, top + cfg.drop_height]
+            data.qpos[world.block_qpos[slot, :3]] = [*xy, top + cfg.scene.drop_height]
             data.qvel[world.block_dofs[slot]] = 0.0
         for _ in range(0, pause, _PIN_EVERY):
             data.qpos[world.block_qpos[pinned, :3]] = places[pinned]
@@ -251,31 +233,26 @@ def pour(
             mujoco.mj_step(data.model, data, nstep=_PIN_EVERY)
         quiet += _PAUSE
         radius = np.linalg.norm(data.qpos[world.block_qpos[:, :2]], axis=1)
-        outside = ~pinned & (radius > 0.5 * extent)
+        outside = ~pinned & (radius > 0.5 * cfg.heightmap.extent)
         waiting += [int(slot) for slot in np.flatnonzero(outside)]
         pinned |= outside
-        if not waiting and quiet >= cfg.settle_time:
-            return _at_rest(world, extent, scene, data)
+        if not waiting and quiet >= cfg.scene.settle_time:
+            return _rested(world, cfg, scene, data)
     return None
 
 
-def _at_rest(
-    world: World, extent: float, scene: SceneState, data: mujoco.MjData
-) -> SceneState | None:
-    """Reads the poses of the blocks; None if one is not at rest or left the workspace."""
+def _rested(world: World, cfg: Config, scene: SceneState, data: mujoco.MjData) -> SceneState | None:
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
-    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * extent
+    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * cfg.heightmap.extent
     ok &= (speed.max(axis=1) < scene_state.STILL) & (position[:, 2] > 0.0)
     ok &= np.isfinite(pose).all(axis=1)
     if not np.all(ok | ~scene.in_play):
         return None
     in_play, upright = scene.in_play[:, None], np.array([1, 0, 0, 0], np.float32)
-    return scene.replace(
-        position=np.where(in_play, position, scene.position),
-        quaternion=np.where(in_play, quaternion, upright),
-    )
+    position = np.where(in_play, position, scene.position)
+    return scene.replace(position=position, quaternion=np.where(in_play, quaternion, upright))
 
 
 def shipped() -> Path:
@@ -284,23 +261,20 @@ def shipped() -> Path:
 
 
 def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
-    """Hashes everything that decides the content of a pool; `how` tells ways to make it apart."""
+    """Hashes all that decides the content of a pool; `how` names the way to make it."""
     scene = dataclasses.replace(cfg.scene, packed_fraction=0.0)
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=object_slots.library(scene).sha256)
-    content = hashlib.sha256(
-        repr((_VERSION, mujoco.__version__, repr(scene), *numbers, *how)).encode()
-    )
+    settings = repr((_VERSION, mujoco.__version__, repr(scene), *numbers, *how))
+    content = hashlib.sha256(settings.encode())
     code = [arrange.__file__, packings.__file__] if "arranged" in how else []
-    bodies = ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml")
-    for path in (*(assets() / name for name in bodies), *map(Path, code)):
-        content.update(path.read_bytes())
+    for path in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml", *code):
+        content.update((assets() / path).read_bytes())  # an absolute path replaces the folder
     return content.hexdigest()[:32]
 
 
 def _read(path: Path) -> SceneState | None:
-    """Reads stored scenes; None for a file that is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files if name != "sha256"}
@@ -310,13 +284,12 @@ def _read(path: Path) -> SceneState | None:
 
 
 def _write(path: Path, scenes: SceneState) -> None:
-    """Caches scenes for later runs; a cache that cannot be written is no error."""
     arrays: dict[str, Any] = {k: leaf for k, leaf in vars(scenes).items() if leaf is not None}
     temporary = path.with_name(f"{path.stem}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as file:
             np.savez(file, **arrays)
         temporary.replace(path)
-    except OSError:
+    except OSError:  # the next run settles them again
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)

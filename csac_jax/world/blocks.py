@@ -1,9 +1,8 @@
 """The block set of VPG (arXiv:1803.09956): eight shapes in ten colours.
 
-A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. A block's
-frame has its origin at the centre of the bounding box, whose half, `half_size`, differs between
-scenes. Boxes and arches scale along each axis, the other shapes as a whole. An arch is three convex
-parts, every other shape one.
+A slot of kind `box` may hold cube, cuboid, plank or tile; every other kind is one shape. The origin
+of a block's frame is the centre of its bounding box. Boxes and arches scale along each axis, the
+other shapes as a whole. An arch is three convex parts, every other shape one.
 """
 
 from typing import Any, NamedTuple
@@ -36,29 +35,17 @@ OBJECT_HALF = (0.03, 0.03, 0.03)  # m, of slots of kind object before they get o
 MAX_FACES = 10
 PADDING_OFFSET = 1e3  # m, offset of a padding face: every point lies inside it
 
-_COLOURS = {  # sRGB (Tableau's ten, as in VPG)
-    "blue": (78, 121, 167),
-    "green": (89, 161, 79),
-    "brown": (156, 117, 95),
-    "orange": (242, 142, 43),
-    "yellow": (237, 201, 72),
-    "grey": (186, 176, 172),
-    "red": (255, 87, 89),
-    "purple": (176, 122, 161),
-    "cyan": (118, 183, 178),
-    "pink": (255, 157, 167),
-}
-COLOURS = np.array([*_COLOURS.values()], np.float32) / np.float32(255)  # [10, 3] sRGB in 0..1
-COLOUR_NAMES = tuple(_COLOURS)
+_NAMES = "blue green brown orange yellow grey red purple cyan pink"  # Tableau's ten, as in VPG
+_SRGB = "4e79a7 59a14f 9c755f f28e2b edc948 bab0ac ff5759 b07aa1 76b7b2 ff9da7"
+COLOUR_NAMES = tuple(_NAMES.split())
+COLOURS = np.array([[*bytes.fromhex(_SRGB)]], np.float32).reshape(10, 3) / np.float32(255)  # 0..1
 TABLE_COLOUR = np.array([0.35, 0.33, 0.31], np.float32)
 
 
 def half_size_choices(kind: SlotKind) -> np.ndarray:
     """Returns nominal half sizes [choices, 3] m of the shapes that a slot of a kind may hold."""
-    if kind == "object":
-        return np.array([OBJECT_HALF], np.float32)
-    shapes = SHAPES.values()
-    return np.array([shape.half_size for shape in shapes if shape.kind == kind], np.float32)
+    halves = [shape.half_size for shape in SHAPES.values() if shape.kind == kind]
+    return np.array(halves or [OBJECT_HALF], np.float32)
 
 
 def is_object(slots: tuple[SlotKind, ...]) -> np.ndarray:
@@ -72,7 +59,6 @@ def is_mesh(slots: tuple[SlotKind, ...]) -> np.ndarray:
 
 
 Faces = tuple[np.ndarray, np.ndarray]  # outward normals [F, 3], offsets [F] m, of nominal size
-
 # Centre and half size of every convex part, in units of the block's half size.
 _WHOLE = (((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),)
 _ARCH = (  # two posts and a lintel: a square tunnel, 50 x 25 mm, for the half-round of VPG
@@ -99,7 +85,7 @@ def parts(slots: tuple[SlotKind, ...]) -> Parts:
 
 
 def _prism_faces() -> Faces:
-    """Returns a triangular prism: base down, two ends across y, two slopes up to the apex."""
+    # Base down, two ends across y, two slopes up to the apex.
     x, y, z = SHAPES["prism"].half_size
     slope = np.array([2 * z, 0.0, x]) / np.hypot(2 * z, x)
     normals = np.array([[0, 0, -1], [0, 1, 0], [0, -1, 0], slope, slope * [-1, 1, 1]])
@@ -107,7 +93,7 @@ def _prism_faces() -> Faces:
 
 
 def _half_cylinder_faces() -> Faces:
-    """Returns six chords of a half circle about y, its flat face down."""
+    # Six chords of a half circle about y, its flat face down.
     radius, y, z = SHAPES["half_cylinder"].half_size
     angle = (np.arange(6) + 0.5) * np.pi / 6
     round_ = np.stack([np.cos(angle), np.zeros(6), np.sin(angle)], axis=1)
@@ -117,7 +103,7 @@ def _half_cylinder_faces() -> Faces:
 
 
 def _cylinder_faces() -> Faces:
-    """Returns an octagonal prism through a circle about z."""
+    # An octagon through a circle about z.
     radius, _, z = SHAPES["cylinder"].half_size
     angle = (np.arange(8) + 0.5) * np.pi / 4
     sides = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
@@ -139,8 +125,7 @@ FACES = {
 def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Computes the faces of every part in its block's frame: inside, n . p <= offset for all.
 
-    Args: half_size [N, 3] m. Returns: normals [G, F, 3], outward unit vectors, 0 for padding;
-    offsets [G, F] m. G as in `parts`.
+    Returns: outward unit normals [G, F, 3], 0 for padding; offsets [G, F] m.
     """
     slot, centre, half = parts(slots)
     normals = np.zeros((len(slot), MAX_FACES, 3), np.float32)
@@ -156,10 +141,7 @@ def half_spaces(slots: tuple[SlotKind, ...], half_size: jax.Array) -> tuple[jax.
 
 
 def scales(cfg: SceneConfig, noise: Any) -> Any:
-    """Computes sizes of the slots' blocks [N] relative to nominal, from noise [N] in -1 .. 1.
-
-    MJX shares a mesh between all slots of a kind: they take the scale of the first.
-    """
+    """Computes sizes [N] relative to nominal from noise [N] in -1 .. 1; of one mesh, one size."""
     shared, jitter = is_mesh(cfg.slots), np.array(cfg.size_jitter, np.float32)
     first = [cfg.slots.index(kind) for kind in cfg.slots]
     leader = np.where(shared, first, np.arange(len(first)))

@@ -12,10 +12,9 @@ from csac_jax.world.solids import GeomGroup, Kind, Solids
 
 
 def read(model: mujoco.MjModel) -> Solids:
-    """Reads the visible geoms of a model at rest, NumPy leaves, with the model's numbers.
+    """Reads the geoms of a model at rest, NumPy leaves; a mesh as its hull, not those of opacity 0.
 
-    Geoms of opacity 0 are left out. A mesh is its convex hull. Raises ValueError with the name of a
-    geom of another type.
+    Raises ValueError with the name of a geom of another type.
     """
     materials = np.concatenate([model.mat_rgba, np.zeros((1, 4), np.float32)])
     no_material = model.geom_matid[:, None] < 0  # -1: the last row
@@ -31,23 +30,18 @@ def read(model: mujoco.MjModel) -> Solids:
 
 
 def _kind(model: mujoco.MjModel, geom: int) -> Kind:
-    try:
-        return Kind(model.geom_type[geom])
-    except ValueError:
-        name, unknown = model.geom(geom).name or geom, _type_name(model.geom_type[geom])
-        known = ", ".join(_type_name(kind.value) for kind in Kind)
-        raise ValueError(f"geom {name}: rays do not meet type {unknown}; use: {known}") from None
-
-
-def _type_name(geom_type: int) -> str:
-    return mjtGeom(geom_type).name.removeprefix("mjGEOM_").lower()
+    kind = model.geom_type[geom]
+    if kind not in {known.value for known in Kind}:
+        unknown, *known = (mjtGeom(k).name[7:].lower() for k in (kind, *(k.value for k in Kind)))
+        name = model.geom(geom).name or geom
+        raise ValueError(f"geom {name}: rays do not meet type {unknown}; use: {', '.join(known)}")
+    return Kind(kind)
 
 
 def _group(model: mujoco.MjModel, kind: Kind, geoms: Any) -> GeomGroup:
-    is_mesh, unplaced = kind is Kind.POLYTOPE, np.zeros(0, np.float32)
-    shape = _half_spaces(model, geoms) if is_mesh else model.geom_size[geoms].astype(np.float32)
-    leaves: tuple[Any, ...] = (shape, unplaced, unplaced, geoms)
-    return GeomGroup(kind, *leaves)
+    size, unplaced = model.geom_size[geoms].astype(np.float32), np.zeros(0, np.float32)
+    shape: Any = _half_spaces(model, geoms) if kind is Kind.POLYTOPE else size
+    return GeomGroup(kind, shape, unplaced, unplaced, geoms)  # type: ignore[arg-type]
 
 
 def _half_spaces(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray:

@@ -102,7 +102,6 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
 
 
 def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
-    """Adds the block material and the meshes, at this scale."""
     path = assets() / "blocks.xml"
     part = mjcf.read(path)
     mjcf.require(path, "mesh", MESH_KINDS, part.meshes)
@@ -114,7 +113,7 @@ def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
 
 
 def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> None:
-    """Adds a sensor [1] of the number of contacts for each of palm and pads x slots, in order."""
+    """Adds a sensor of the number of contacts for each of palm and pads x slots, in order."""
     for geom in mjcf.hand_geoms(gripper):
         for slot in range(slots):
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
@@ -138,26 +137,25 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 def build(scene: SceneConfig, sim: SimConfig) -> World:
     """Builds the world of table, robot and block slots; blocks parked, at their largest size.
 
-    Raises SceneError for MJCF files that lack an element addressed by name, do not compile, or set
-    something that MJX, if it is to run them, ignores. Raises SettingsError for an unknown gripper.
+    Raises SceneError for MJCF that lacks a named element, does not compile, or that MJX ignores.
     """
     gripper = grippers.load(sim.gripper)
-    try:
+    with mjcf.errors_of(assets()):
         model = _spec(scene, sim, gripper).compile()
-    except ValueError as error:
-        raise mjcf.one_line(assets(), error) from None
-    if sim.physics == "mjx":
-        _check_mjx(model)
+    for field in _MJX_IGNORES if sim.physics == "mjx" else ():  # `put_model` raises for others
+        if np.any(operator.attrgetter(field)(model)):
+            raise SceneError(f"MJX ignores {field}; leave it at 0, or take sim.physics c")
     _align_inertia(model)
-    slots = np.arange(len(scene.slots))
-    bodies = np.array([model.body(f"block{slot}").id for slot in slots])
+    bodies = np.array([model.body(f"block{slot}").id for slot in range(len(scene.slots))])
     free_joints = model.body_jntadr[bodies]
     slot_of_body = np.full(model.nbody, -1)
-    slot_of_body[bodies] = slots
+    slot_of_body[bodies] = np.arange(len(bodies))
     slot_of_geom = slot_of_body[model.geom_bodyid]
     joints = mjcf.joint_names(sim, gripper)
-    objects_at = np.flatnonzero(blocks.is_object(scene.slots))
-    library = object_slots.library(scene) if objects_at.size else None
+    objects_at, bodies_of = np.flatnonzero(blocks.is_object(scene.slots)), None
+    if scene.has_objects:
+        library = object_slots.library(scene)
+        bodies_of = objects.read(model, objects_at, bodies[objects_at], library)
     return World(
         model=model,
         slots=scene.slots,
@@ -171,17 +169,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         gripper=gripper,
         hand_geoms=np.array([model.geom(name).id for name in mjcf.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
-        objects=None
-        if library is None
-        else objects.read(model, objects_at, bodies[objects_at], library),
+        objects=bodies_of,
     )
-
-
-def _check_mjx(model: mujoco.MjModel) -> None:
-    """Raises SceneError for a setting that MJX ignores; `put_model` raises for what it lacks."""
-    for field in _MJX_IGNORES:
-        if np.any(operator.attrgetter(field)(model)):
-            raise SceneError(f"MJX ignores {field}; leave it at 0, or take sim.physics c")
 
 
 def _align_inertia(model: mujoco.MjModel) -> None:
@@ -221,11 +210,10 @@ class BlockFields:
 
 
 def scene_fields(world: World, scene: SceneState) -> BlockFields:
-    """Computes the fields that follow from sizes, densities and frictions of one scene.
+    """Computes what MuJoCo's compiler derives from sizes, densities and frictions of one scene.
 
-    Closed forms of what MuJoCo's compiler derives. Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3,
-    parts about their common centre of mass by the parallel axis theorem. Meshes by their scale s:
-    m ~ rho s^3, I ~ rho s^5. Blocks of one mesh kind in a scene share their size.
+    Boxes: m = 8 rho a b c, I_x = m (b^2 + c^2) / 3, parts about their common centre of mass by the
+    parallel axis theorem. Meshes by their scale s: m ~ rho s^3, I ~ rho s^5.
     """
     scene = jax.tree.map(jnp.asarray, scene)
     fields = _with_meshes(world, scene, _box_fields(world, scene))
@@ -238,19 +226,17 @@ def scene_fields(world: World, scene: SceneState) -> BlockFields:
 
 
 def _pads(world: World, fingers: Fingers) -> PadFields:
-    """Computes the pads of these fingers; whatever the size, their inner faces stay in place."""
+    """Computes pads of these sizes; their inner faces stay in place."""
     model, pads = world.model, world.hand_geoms[1:]
     length = jnp.full(2, model.geom_size[pads, 2], jnp.float32)
-    half = jnp.stack([jnp.full(2, 0.5 * fingers.thickness), jnp.full(2, 0.5 * fingers.width)])
+    half = (jnp.full(2, 0.5 * side) for side in (fingers.thickness, fingers.width))
     size = jnp.column_stack([*half, length])
-    outward = np.sign(model.geom_pos[pads, 0])
-    along = outward * size[:, 0]
+    along = np.sign(model.geom_pos[pads, 0]) * size[:, 0]
     position = jnp.asarray(model.geom_pos[pads], jnp.float32).at[:, 0].set(along)
     return PadFields(size, position, jnp.linalg.norm(size, axis=1))
 
 
 def _box_fields(world: World, scene: SceneState) -> BlockFields:
-    """Computes the fields as if every slot were made of boxes."""
     slot = world.parts.slot
     half_size = scene.half_size[slot]
     half, centre = half_size * world.parts.half, half_size * world.parts.centre
@@ -328,7 +314,6 @@ def with_blocks(
     """Writes blocks of these fields (NumPy) into a copy of the world's model, or into `into`.
 
     `into` is an earlier copy and data of it: to allocate them takes longer than all the rest.
-    `mj_setConst` must follow: C takes a free body's mass matrix from `dof_M0`, not from its mass.
     """
     model, scratch = into or (copy.copy(world.model), mujoco.MjData(world.model))
     geoms, bodies = world.block_geoms, world.block_bodies
@@ -344,5 +329,5 @@ def with_blocks(
         model.geom_size[pads], model.geom_pos[pads], model.geom_rbound[pads] = fields.pads
     if world.objects is not None and fields.objects is not None:
         objects.put(model, world.objects, fields.objects)
-    mujoco.mj_setConst(model, scratch)
+    mujoco.mj_setConst(model, scratch)  # C takes a free body's mass matrix from `dof_M0`
     return model

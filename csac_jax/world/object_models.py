@@ -1,9 +1,8 @@
 """Objects of a library in a MuJoCo model.
 
-The model has the meshes of all objects, and bodies with as many geoms as the object of most parts.
-For a scene, the geoms of a body get the meshes of its object, with all fields that the compiler
-derives from a mesh. `mj_setConst` must follow: it updates dependent fields, such as the search
-trees over a body's geoms. Without it contacts would be missed silently.
+The model has the meshes of all objects. For a scene, the geoms of a body get those of its object,
+with all fields that the compiler derives from a mesh. `mj_setConst` must follow: without it, search
+trees over a body's geoms are stale, and contacts are missed silently.
 """
 
 import dataclasses
@@ -27,16 +26,12 @@ class ObjectFields(NamedTuple):
 
 
 class PartFields(NamedTuple):
-    """Fields that MuJoCo's compiler derives from the meshes of objects, [O, P, ...].
-
-    The frame of a mesh is that of its inertia. Its size reaches from the frame's origin to the
-    farthest corner along each axis. Its radius is the norm of that size.
-    """
+    """Fields that MuJoCo derives from the meshes of objects, in the frames of their inertias."""
 
     position: np.ndarray  # [O, P, 3] m, of the frame in the body
     quaternion: np.ndarray  # [O, P, 4] (w, x, y, z) of the frame in the body
-    size: np.ndarray  # [O, P, 3] m
-    radius: np.ndarray  # [O, P] m
+    size: np.ndarray  # [O, P, 3] m, from the frame's origin to the farthest corner
+    radius: np.ndarray  # [O, P] m, norm of the size
     box: np.ndarray  # [O, P, 2, 3] m, centre and half size of the bounding box in the frame
 
 
@@ -66,10 +61,7 @@ def _mesh(number: int, part: int) -> str:
 
 
 def add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, objects: Library) -> None:
-    """Adds the geoms of one slot, all with the first mesh.
-
-    The inertia stands in for those of scenes, whose axes are not the body's.
-    """
+    """Adds the geoms of one slot, all with the first mesh, and an inertia that scenes replace."""
     for _ in range(tables.from_library(objects).present.shape[1]):
         geom = body.add_geom(spec.find_default("blocks/block"))
         geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, _mesh(0, 0)
@@ -79,10 +71,7 @@ def add_geoms(spec: mujoco.MjSpec, body: mujoco.MjsBody, objects: Library) -> No
 
 
 def read(model: mujoco.MjModel, slots: np.ndarray, bodies: np.ndarray, objects: Library) -> Bodies:
-    """Finds the objects in a compiled model; `slots` [M] and `bodies` [M] are theirs.
-
-    The model's last meshes are those of the objects, in order.
-    """
+    """Finds the objects in a compiled model, of which they are the last meshes, in order."""
     table = tables.from_library(objects)
     geoms = model.body_geomadr[bodies][:, None] + np.arange(table.present.shape[1])
     counts = table.present.sum(axis=1)  # [O]

@@ -29,9 +29,9 @@ def table(cfg: SceneConfig) -> Tables:
 def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> SceneState:
     """Draws the objects of a scene; none repeats before all have been drawn."""
     slots, objects = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
-    rounds = -(-len(slots) // len(objects.half))
-    order = np.concatenate([rng.permutation(len(objects.half)) for _ in range(rounds)])
-    return hold(scene, slots, order[: len(slots)], objects)
+    count = len(objects.half)
+    order = [rng.permutation(count) for _ in range(0, len(slots), count)]
+    return hold(scene, slots, np.concatenate(order)[: len(slots)], objects)
 
 
 def hold(scene: SceneState, slots: np.ndarray, numbers: np.ndarray, objects: Tables) -> SceneState:
@@ -46,9 +46,8 @@ _TRIES = 200  # random places tried for each
 
 
 def packed(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> SceneState:
-    """Places the objects in play on the table, upright as in their files.
+    """Places the objects in play at random, upright, outlines GAP apart, within `drop_extent`.
 
-    Places in the square of side `drop_extent` and yaws are random, outlines GAP or more apart.
     Raises SceneError where there is no room.
     """
     half = 0.5 * rng.uniform(*cfg.drop_extent)
@@ -60,8 +59,7 @@ def packed(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> Sce
         for _ in range(_TRIES):
             yaw, xy = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(-half, half, 2)
             cos, sin = np.cos(yaw), np.sin(yaw)
-            turn = np.array([[cos, sin], [-sin, cos]])
-            outline = np.einsum("ni,ij->nj", corners[:, :2], turn) + xy
+            outline = np.einsum("ni,ij->nj", corners[:, :2], [[cos, sin], [-sin, cos]]) + xy
             outline = outline[ConvexHull(outline).vertices]
             if np.abs(outline).max() <= half and all(_apart(outline, other) for other in outlines):
                 break
@@ -77,8 +75,7 @@ def packed(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> Sce
 
 
 def _apart(one: np.ndarray, two: np.ndarray) -> bool:
-    """Tests for a gap of GAP between convex outlines [n, 2] m, along the normal of some side."""
-    for first, second in itertools.permutations((one, two)):
+    for first, second in itertools.permutations((one, two)):  # along the normals of the sides
         side = np.roll(first, -1, axis=0) - first
         normal = np.column_stack([side[:, 1], -side[:, 0]])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -89,10 +86,7 @@ def _apart(one: np.ndarray, two: np.ndarray) -> bool:
 
 
 def fingerprint(cfg: SceneConfig, scenes: SceneState) -> str:
-    """Returns a SHA-256 of objects, densities, frictions and colours of scenes [P, N, ...].
-
-    Physics changes none of these, so it is the same on every machine.
-    """
+    """Returns a SHA-256 of all in scenes [P, N, ...] that physics leaves alone."""
     objects = library(cfg).objects
     content = hashlib.sha256()
     for number, in_play in zip(scenes.numbers.ravel(), scenes.in_play.ravel(), strict=True):

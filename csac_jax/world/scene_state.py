@@ -14,9 +14,9 @@ from csac_jax.world import blocks
 
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
 NOMINAL_FRICTION = 0.8
+# Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
+# spins faster, and the explicit gyroscopic torque would lead to NaN.
 SPEED_LIMIT = np.array([5, 5, 5, 50, 50, 50], np.float32)
-"""Fastest block after a substep, m/s and rad/s (ours). A thin block squeezed from under the hand
-spins faster, and the explicit gyroscopic torque would lead to NaN."""
 STILL = 0.008  # m/s, ours: slower counts as at rest
 ANY = -1  # `Scene.target` in the clearing task
 
@@ -72,13 +72,11 @@ def parked(slots: tuple[SlotKind, ...]) -> SceneState:
 def park(scene: SceneState, keep: jax.Array) -> SceneState:
     """Moves all blocks but those in `keep` [N] bool to their parking places."""
     keep = scene.in_play & keep
-    upright = jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32)[None]
-    return scene.replace(
-        position=jnp.where(keep[:, None], scene.position, parking(keep.shape[0])),
-        quaternion=jnp.where(keep[:, None], scene.quaternion, upright),
-        velocity=jnp.where(keep[:, None], scene.velocity, 0.0),
-        in_play=keep,
-    )
+    column, upright = keep[:, None], jnp.eye(1, 4, dtype=jnp.float32)
+    position = jnp.where(column, scene.position, parking(keep.shape[0]))
+    quaternion = jnp.where(column, scene.quaternion, upright)
+    velocity = jnp.where(column, scene.velocity, 0.0)
+    return scene.replace(position=position, quaternion=quaternion, velocity=velocity, in_play=keep)
 
 
 def rotate(scene: SceneState, yaw: jax.Array) -> SceneState:
@@ -125,8 +123,7 @@ def randomise_pose(
 ) -> SceneState:
     """Rotates a scene by a random yaw; with `has_target` it keeps its target or gets one.
 
-    The yaw is a multiple of 90 degrees unless `any_yaw` and every block stays within the square of
-    side `extent` m.
+    Without `any_yaw`, or where a block would leave the square of `extent` m, by quarter turns.
     """
     key_yaw, key_target = jax.random.split(key)
     yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)

@@ -44,9 +44,6 @@ class Solids:
 def place(solids: Solids, xpos: jax.Array | np.ndarray, xmat: jax.Array | np.ndarray) -> Solids:
     """Moves the geoms to poses xpos [geoms, 3] m and xmat [geoms, 9 or 3, 3], geom to world."""
     rotation = xmat.reshape(-1, 3, 3)
-    return solids.replace(
-        groups=tuple(
-            group.replace(position=xpos[group.geom], rotation=rotation[group.geom])
-            for group in solids.groups
-        )
-    )
+    poses = ({"position": xpos[g.geom], "rotation": rotation[g.geom]} for g in solids.groups)
+    groups = (group.replace(**pose) for group, pose in zip(solids.groups, poses, strict=True))
+    return solids.replace(groups=tuple(groups))

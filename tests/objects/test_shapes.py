@@ -59,21 +59,6 @@ def test_a_tube_has_its_closed_form():
     assert tube.volume == pytest.approx(area * np.ptp(corners[:, 2]), rel=1e-4)
 
 
-@pytest.mark.parametrize(("half", "parts"), [(0.03, 4), (0.007, 1)])
-def test_a_wall_has_its_closed_form(half: float, parts: int):
-    """Claim: a wall inside a square is the frustum of the square less that of a bore, which leaves
-    4 to 8 mm; a square of less than some 10 mm is full. Some assemblies have a wall."""
-    square, height = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), 0.05
-    wall = shapes._fence(np.random.default_rng(2), 0.01 + square, 0.02, 0.02 + height)
-    thick, flare = np.random.default_rng(2).uniform([0.004, 0.7], [0.008, 1.2])
-    full = 4.0 * half**2 * height * (1.0 + flare + flare**2) / 3.0
-    bore = ((half - thick) / half) ** 2 if parts == 4 else 0.0
-    assert len(wall) == parts
-    volume = sum(solid.moments(part).volume for part in wall)
-    assert volume == pytest.approx(full * (1.0 - bore), rel=1e-5)
-    assert 3 < sum(len(member.parts) > 5 for member in ASSEMBLIES) < 20  # a block has no more
-
-
 def test_shapes_follow_from_the_seed():
     """Claim: at least 12 families are drawn in turn; a longer list begins with the shorter one;
     another seed gives others."""

@@ -8,7 +8,7 @@ import scipy.linalg
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from csac_jax.objects import solid
+from csac_jax.objects import body, solid
 
 CUBE = np.array([*itertools.product((0.0, 1.0), repeat=3)])
 
@@ -79,4 +79,4 @@ def test_narrowest_side_of_a_box():
     """Claim: a box turned in space is as narrow as its shortest side."""
     turn = trimesh.transformations.random_rotation_matrix()[:3, :3]
     part = solid.convex(CUBE * [0.02, 0.05, 0.09] @ turn.T)
-    assert solid.narrowest([part]) == pytest.approx(0.02, rel=1e-4)
+    assert body.make("box", [part]).narrowest == pytest.approx(0.02, rel=1e-4)

@@ -56,7 +56,7 @@ def _angles_apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _arm() -> mujoco.MjModel:
-    """The arm with the capsules of the gripper, which `ur5.xml` leaves to the gripper."""
+    """Compiles the arm with the gripper's capsules."""
     spec = mujoco.MjSpec.from_file(str(assets() / "ur5.xml"))
     tip = ARM.links.d6 + ARM.tool
     capsules = ("tool", 0.0, tip - 0.115, 0.045), ("fingers", tip - 0.115, tip - 0.07, 0.07)
@@ -76,14 +76,6 @@ def _plans(num: int, seed: int = 0) -> primitives.Plan:
     top = rng.choice(np.float32([0.0, 0.05, 0.15]), num)
     height = jnp.asarray(np.broadcast_to(top[:, None, None], (num, MAP.size, MAP.size)))
     return jax.jit(jax.vmap(functools.partial(primitives.plan, SIM, MAP)))(height, actions)
-
-
-@functools.cache
-def _moves(num: int = 64) -> tuple[np.ndarray, tuple[jax.Array, jax.Array]]:
-    """Set-points [num, 1 + T, 5] of plans, start included, and the joint targets through them."""
-    plan = _plans(num)
-    control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
-    return np.asarray(control), targets_of_batch(HOME, control)
 
 
 MOVED = {"base": (-0.5, 0.3, 0.2, 1.1), "adapter": 0.04, "gripper": "franka_hand"}
@@ -181,11 +173,9 @@ def test_eight_branches_are_distinct():
 CENTRE, ABOVE_BASE = (0.0, 0.0, 0.1), ARM.base[2] + 0.5
 NOWHERE = {
     "beyond": ((-0.6, 0.0, 0.1), 0.0),
-    "very far": ((1e30, 0.0, 0.1), 0.0),
     "within the wrist's width": ((ARM.base[0] + 0.5 * ARM.links.d4, 0.0, ABOVE_BASE), 0.0),
     "both shoulders meet": ((ARM.base[0], ARM.links.d4, ABOVE_BASE), 0.0),
     "nan": ((0.0, np.nan, 0.1), 0.0),
-    "nan yaw": (CENTRE, np.nan),
     "infinite": ((0.0, 0.0, -np.inf), 0.0),
     "no rotation": (CENTRE, None),
 }
@@ -204,9 +194,7 @@ def test_poses_without_an_answer(name: str):
     assert all(np.isfinite(gradient).all() for gradient in gradients(*pose))
 
 
-@pytest.mark.parametrize(
-    ("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, -0.005), (4, np.pi)]
-)
+@pytest.mark.parametrize(("joint", "angle"), [(2, 0.0), (2, 0.005), (4, 0.0), (4, np.pi)])
 def test_singular_branches_are_flagged(joint: int, angle: float):
     """Claim: with a straight elbow or wrist, the branches that meet there do not count."""
     pose = kinematics.forward(ARM, jnp.array([0.3, -0.5, 1.0, -1.0, 1.0, 0.2]).at[joint].set(angle))
@@ -216,30 +204,6 @@ def test_singular_branches_are_flagged(joint: int, angle: float):
     assert not valid.all()
     sines = np.abs(np.sin(solutions[valid][:, [2, 4]]))
     assert (sines > 0.9 * kinematics.SINGULAR).all()
-
-
-def test_wrist_at_its_very_singularity():
-    """Claim: where the wrist's angles are undefined, they and their gradients are finite."""
-    zero, one = jnp.zeros(()), jnp.ones(())
-    for output in range(2):
-        angle, slopes = jax.value_and_grad(
-            lambda *z, output=output: kinematics._wrist(*z)[output], (0, 1, 2)
-        )(zero, zero, one, one)
-        assert np.isfinite([angle, *slopes]).all()
-    assert not kinematics._wrist(zero, zero, one, one)[2]
-
-
-def test_gradient_of_inverse():
-    """Claim: the derivative of a branch is the inverse of that of the tips' position and yaw."""
-    xyz, yaw = jnp.array([0.1, -0.05, 0.1]), jnp.array(0.4)
-
-    def there_and_back(xyz, yaw):
-        branches, _ = kinematics.inverse(ARM, *kinematics.top_down(xyz, yaw))
-        pose = kinematics.forward(ARM, branches[1])
-        return jnp.append(pose.position, jnp.arctan2(pose.rotation[1, 0], pose.rotation[0, 0]))
-
-    by_xyz, by_yaw = jax.jit(jax.jacobian(there_and_back, (0, 1)))(xyz, yaw)
-    np.testing.assert_allclose(np.column_stack([by_xyz, by_yaw]), np.eye(4), atol=1e-4)
 
 
 def test_top_down_is_the_floating_hand():
@@ -252,17 +216,18 @@ def test_top_down_is_the_floating_hand():
     for values in places.astype(np.float32):
         data.qpos[:4] = values
         mujoco.mj_kinematics(model, data)
-        pose, hand = (
-            kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3])),
-            data.body("hand/hand"),
-        )
+        pose = kinematics.top_down(jnp.asarray(values[:3]), jnp.asarray(values[3]))
+        hand = data.body("hand/hand")
         np.testing.assert_allclose(pose.position, hand.xpos, atol=1e-6)
         np.testing.assert_allclose(pose.rotation, hand.xmat.reshape(3, 3), atol=1e-6)
 
 
 @pytest.mark.slow
 def test_whole_workspace_is_reachable():
-    """Claim: over every cell, tips 0.01 to 0.35 m high, at 16 yaws, a clear branch counts."""
+    """Claim: over every cell, tips 0.01 to 0.35 m high, at 16 yaws, a clear branch counts. At HOME
+    the tips are 0.2 m above the workspace centre, and the arm is clear."""
+    np.testing.assert_allclose(kinematics.forward(ARM, HOME).position, [0, 0, 0.2], atol=2e-3)
+    assert is_clear(HOME)
 
     @jax.jit
     @functools.partial(jax.vmap, in_axes=(0, None, None))
@@ -274,13 +239,6 @@ def test_whole_workspace_is_reachable():
     for z in np.float32([0.01, 0.12, 0.23, 0.35]):
         for yaw in np.float32(np.arange(16) * np.pi / 8):
             assert reachable(centres, z, yaw).all(), (z, yaw)
-
-
-def test_home_is_above_the_centre():
-    """Claim: at HOME the tips are 0.2 m above the workspace centre, and the arm is clear."""
-    tips = kinematics.forward(ARM, HOME).position
-    np.testing.assert_allclose(tips, [0, 0, 0.2], atol=2e-3)
-    assert is_clear(HOME)
 
 
 ARM_PARTS = ("base", "shoulder", "upper_arm", "elbow", "forearm", "wrist1", "wrist2")
@@ -328,20 +286,19 @@ def test_links_left_out_never_change():
 
 
 def test_targets_hits_the_set_points():
-    """Claim: the joint targets put the tips on every set-point of a plan."""
-    control, (target, reachable) = _moves()
+    """Claim: the joint targets put the tips on every set-point of a plan. Over flat surfaces no
+    joint turns faster between them than the maker's 180 degrees per second, none leaves its limits,
+    and the arm is clear all the way."""
+    plan = _plans(64)
+    control = jnp.concatenate([plan.start[:, None], plan.control], axis=1)
+    target, reachable = targets_of_batch(HOME, control)
     assert reachable.all()
     tips = jax.jit(jax.vmap(jax.vmap(functools.partial(kinematics.forward, ARM))))(target[..., :6])
     wanted = jax.jit(jax.vmap(jax.vmap(kinematics.top_down)))(control[..., :3], control[..., 3])
     distance, angle = _errors(tips, wanted)
     assert distance.max() < POSITION
     assert angle.max() < ANGLE
-
-
-def test_targets_is_continuous():
-    """Claim: over flat surfaces no joint turns faster between set-points than the maker's 180
-    degrees per second, none leaves its limits, and the arm is clear all the way."""
-    joints = np.asarray(_moves()[1][0][..., :6])
+    joints = np.asarray(target[..., :6])
     assert np.abs(np.diff(joints, axis=1)).max() < np.pi * SIM.timestep
     assert (np.abs(joints) <= kinematics.LIMITS).all()
     assert clear(joints).all()
@@ -378,18 +335,14 @@ def test_targets_keeps_to_one_branch():
 
 
 def test_targets_takes_the_branch_it_is_in():
-    """Claim: of branches that reach every set-point, the one with the least motion is taken."""
+    """Claim: of branches that reach every set-point, the one with the least motion is taken; none
+    through the table or the arm itself."""
     control, solutions, valid, is_free = _branches(*WAY)
     whole = np.flatnonzero((valid & is_free).all(axis=0))
     assert whole.size >= 2
     for branch in whole:
         target, _ = targets_of(solutions[0, branch], control)
         np.testing.assert_allclose(target[0, :6], solutions[0, branch], atol=1e-5)
-
-
-def test_targets_leaves_a_branch_that_is_not_clear():
-    """Claim: a branch through the table or the arm itself is not taken."""
-    control, solutions, valid, is_free = _branches(*WAY)
     blocked = np.flatnonzero(valid.all(axis=0) & ~is_free.any(axis=0))
     assert blocked.size
     for branch in blocked:
@@ -422,17 +375,6 @@ def test_targets_stops_where_reach_ends(lost: tuple[float, ...]):
     nowhere, reachable = targets_of(HOME, control.at[0].set(jnp.array(lost)))
     assert not reachable
     np.testing.assert_array_equal(nowhere[:, :6], np.broadcast_to(kinematics.HOME, (50, 6)))
-
-
-def test_one_scene_is_not_the_others_matter():
-    """Claim: a trajectory in a batch, with one out of reach, is the one that it is alone."""
-    control, (expected, _) = _moves()
-    control = jnp.asarray(control[:32]).at[7, :, 0].set(-5.0)
-    batch, reachable = targets_of_batch(HOME, control)
-    np.testing.assert_array_equal(reachable, np.arange(32) != 7)
-    alone, _ = targets_of(HOME, control[3])
-    np.testing.assert_allclose(batch[3], alone, atol=1e-5)
-    np.testing.assert_allclose(batch[3], expected[3], atol=1e-5)
 
 
 def test_reaches_is_what_the_targets_say():

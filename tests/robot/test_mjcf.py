@@ -84,14 +84,11 @@ def _changed(folder: Path, name: str, *changes: tuple[str, str]) -> str:
 SPARE = '<joint name="spare" axis="0 1 0"/><geom name="palm"'
 UNFIT = {
     "geom": ('name="pad_low"', 'name="left"', "geom 'pad_low' is missing; it has: palm, "),
-    "palm": ('"palm"', '"Palm"', "geom 'palm' is missing; it has: Palm, "),
     "body": ('<body name="hand"', '<body name="base"', "body 'hand' is missing; it has: "),
     "joint": ('joint name="finger_high"', 'joint name="f"', "joint 'finger_high' is missing"),
     "actuator": ('<position name="finger"', '<position name="f"', "must be finger, not f"),
-    "second": ("</actuator>", '<motor name="m" joint="finger_low"/></actuator>', "not finger, m"),
     "spare": ('<geom name="palm"', SPARE, "joint 'spare' is not among 'joints' of gripper.json"),
     "reference": ('joint2="finger_high"', 'joint2="thumb"', "thumb"),
-    "xml": ("<mujoco", "<mujocoo", "XML parse error"),
     "opening": ('pos="-0.006 0 0"', 'pos="-0.02 0 0"', "opening when closed is 14.0 mm, by "),
     "tips": ('pos="0 0 0.030"', 'pos="0 0 0.050"', "height of the tips when closed is 20.0 mm"),
 }
@@ -110,19 +107,9 @@ def test_mjcf_that_does_not_fit_is_one_line(tmp_path: Path, case: str):
         assert "\n" not in str(error.value)
 
 
-def test_wide_hand_in_numbers_only_is_refused(tmp_path: Path):
-    """Claim: the numbers of one gripper with the MJCF of another are refused, not run wrong."""
-    folder = _changed(tmp_path / "mine", "rg2")
-    path = Path(folder, grippers.NUMBERS)
-    path.write_text(path.read_text().replace("0.110}", "0.085}"))
-    with pytest.raises(SceneError, match=r"opening when open is 110\.0 mm, by gripper\.json 85\.0"):
-        _built(folder)
-
-
 VARIED = '"finger_low" gravcomp="1">'
 CANNOT_VARY = {
     "narrow": ([("0.010 0.013", "0.010 0.012")], "width of pad_low is 24.0 mm, by gripper.json 26"),
-    "thin": ([('size="0.010 ', 'size="0.007 '), ("0.010 0 0.009", "0.007 0 0.009")], "thickness"),
     "frame": (
         [(VARIED, VARIED[:-1] + ' pos="0.004 0 0">'), ("-0.010 0 0.009", "-0.014 0 0.009")],
         "inner face of pad_low in its finger's frame is 4.0 mm",
@@ -144,7 +131,6 @@ def test_pads_that_cannot_vary_are_refused(tmp_path: Path, case: str):
     ("old", "new", "says"),
     [
         ('<geom name="palm"', '<geom name="palm" gap="0.01"', "geom_gap"),
-        ('<geom name="palm"', '<geom name="palm" adhesion="1"', "geom_adhesion"),
         ('joint name="finger_low"', 'joint name="finger_low" stiffness="0 9"', "jnt_stiffnesspoly"),
         ('<position name="finger"', '<position name="finger" armature="1"', "actuator_armature"),
         ('type="box"', 'type="ellipsoid"', "collisions not implemented"),

@@ -26,10 +26,9 @@ def _height(*surfaces: tuple[float, float, float, float]) -> jnp.ndarray:
     return jnp.asarray(height)
 
 
-def _plan(
-    primitive: Primitive, height: jnp.ndarray, x: float = 0.0, y: float = 0.0, yaw: float = 0.0
-) -> Plan:
-    action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
+def _plan(primitive: Primitive, height: jnp.ndarray, *pose: float) -> Plan:
+    place = jnp.array(pose or [0.0, 0.0, 0.0], jnp.float32)
+    action = Action(primitive=jnp.int32(primitive), pose=place)
     return primitives.plan(SIM, MAP, height, action)
 
 
@@ -37,17 +36,14 @@ def _plan(
     ("primitive", "top", "low"),
     [
         (Primitive.GRASP, 0.05, 0.015),  # grasp_depth 35 mm below the top
-        (Primitive.GRASP, 0.10, 0.065),
         (Primitive.GRASP, 0.025, 0.012),  # clearance
-        (Primitive.GRASP, 0.0, 0.012),
         (Primitive.PUSH, 0.05, 0.03),  # push_depth 20 mm below the top
-        (Primitive.PUSH, 0.025, 0.012),
         (Primitive.PUSH, 0.0, 0.012),
     ],
 )
 def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
     """Claim: tips go to grasp_depth or push_depth below the top, never below the clearance."""
-    plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), yaw=0.3)
+    plan = _plan(primitive, _height((0.0, 0.0, 0.05, top)), 0.0, 0.0, 0.3)
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
     assert z.min() == pytest.approx(low, abs=1e-6)
@@ -113,15 +109,12 @@ def test_starts_above_whatever_is_under_the_hand(primitive: Primitive):
     assert near.control[:, Z].min() == pytest.approx(0.012, abs=1e-6)  # the place itself is bare
 
 
-@pytest.mark.parametrize(("offset", "top"), [(0.0, 0.04), (0.009, 0.04), (0.013, 0.0)])
-def test_local_top_is_that_of_the_window(offset: float, top: float):
-    """Claim: the highest surface in a window of 2 cm counts, corners included."""
-    height = _height((offset, -offset, 0.0022, 0.04))
-    assert primitives.local_top(MAP, height, jnp.zeros(2), RG2.finger[1]) == pytest.approx(top)
-
-
-def test_local_top_of_coarse_maps():
-    """Claim: where cells are wider than the window, the cell of the place counts."""
+def test_local_top_is_that_of_the_window():
+    """Claim: the highest surface in a window of 2 cm counts, corners included; where cells are
+    wider than the window, the cell of the place."""
+    for offset, top in ((0.0, 0.04), (0.009, 0.04), (0.013, 0.0)):
+        height = _height((offset, -offset, 0.0022, 0.04))
+        assert primitives.local_top(MAP, height, jnp.zeros(2), RG2.finger[1]) == pytest.approx(top)
     coarse = HeightmapConfig(size=16)  # 28 mm cells
     height = jnp.zeros((16, 16)).at[8, 8].set(0.05)
     centre = cell_centres(coarse)[8, 8]

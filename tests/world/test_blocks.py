@@ -31,11 +31,13 @@ def _corners(kind: str, half: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("shape", CONVEX)
 def test_half_spaces_are_those_of_the_hull(shape: str, scale: float):
     """Claim: a point lies inside a block where n . p <= offset for all its faces, whatever its
-    size."""
+    size. The origin is the centre of the bounding box, whose half sizes are in the table."""
     kind, half = blocks.SHAPES[shape].kind, np.float32(scale) * _half(shape)
     normals, offsets = map(np.asarray, blocks.half_spaces((kind,), jnp.asarray(half[None])))
     points = np.random.default_rng(0).uniform(-0.08, 0.08, (4000, 3))
-    hull = ConvexHull(_corners(kind, half) * (1.0 if kind == "box" else scale)).equations
+    corners = _corners(kind, half) * (1.0 if kind == "box" else scale)
+    np.testing.assert_allclose([corners.max(axis=0), -corners.min(axis=0)], [half] * 2, atol=1e-6)
+    hull = ConvexHull(corners).equations
     depth = (points @ normals[0].T - offsets[0]).max(axis=1)  # of the farthest face: < 0 inside
     np.testing.assert_allclose(depth, (points @ hull[:, :3].T + hull[:, 3]).max(axis=1), atol=2e-6)
     present = offsets[0] < blocks.PADDING_OFFSET
@@ -51,16 +53,6 @@ def test_arch_is_a_block_with_a_tunnel():
     inside = np.any((np.einsum("gfi,pi->pgf", normals, points) <= offsets).all(axis=2), axis=1)
     tunnel = (np.abs(points[:, 0]) < 0.025) & (points[:, 2] < 0.0)
     np.testing.assert_array_equal(inside, (np.abs(points) <= half).all(axis=1) & ~tunnel)
-
-
-@pytest.mark.parametrize("shape", CONVEX)
-def test_half_sizes_are_those_of_the_bounding_box(shape: str):
-    """Claim: the origin of a block is the centre of its bounding box, whose half sizes are in the
-    table."""
-    half = _half(shape)
-    corners = _corners(blocks.SHAPES[shape].kind, half)
-    np.testing.assert_allclose(corners.max(axis=0), half, atol=1e-6)
-    np.testing.assert_allclose(corners.min(axis=0), -half, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", MESH_KINDS)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from csac_jax.config import Config
 from csac_jax.errors import SceneError
 from csac_jax.scenes import pool
-from csac_jax.world import object_slots, scene_state
+from csac_jax.world import object_slots
 from csac_jax.world.scene_state import SceneState
 
 KINDS = ("object",) * 5
@@ -37,8 +37,7 @@ def test_every_scene_draws_its_own_objects():
     """Claim: the objects of a scene are of the split, distinct, and all of them come up; those of a
     library with fewer objects than slots come up as often."""
     seen = set()
-    for seed in range(40):
-        scene = _drop(seed)
+    for scene in map(_drop, range(40)):
         assert len(set(scene.object_id.tolist())) == 5
         seen |= set(scene.object_id.tolist())
     objects = object_slots.library(CONFIG.scene).objects
@@ -130,9 +129,3 @@ def test_fingerprint_names_what_was_drawn():
     for other in (swapped, heavier, drawn(1), drawn(0, 0)):
         assert object_slots.fingerprint(CONFIG.scene, other) != digest
     assert object_slots.fingerprint(CONFIG.scene, drawn(0, 1, 2))[:16] == "faa06c8544b31104"
-
-
-def test_parked_slots_have_a_number():
-    """Claim: a parked slot of an object has the number of one; scenes of blocks have no numbers."""
-    assert scene_state.parked(KINDS).object_id.tolist() == [0] * 5
-    assert scene_state.parked(("box",)).object_id is None
