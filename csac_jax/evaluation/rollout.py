@@ -46,9 +46,8 @@ def evaluate(
     """Measures a policy in scenes that training never saw; the metrics are `metrics`'.
 
     Args: suite, a name of `suites.SUITES`, a case file, or a suite prepared by `suites.prepare`,
-    which holds the other arguments; on_progress, called after every action; for the rest see
-    `suites.prepare`. Returns: the metrics; of a suite with several parts {"parts": {name:
-    metrics}}. Raises ValueError as `suites.prepare`.
+    which has the other arguments; on_progress, called after every action. Returns: the metrics; of
+    a suite with several parts {"parts": {name: metrics}}. Raises ValueError as `suites.prepare`.
     """
     if not isinstance(suite, PreparedSuite):
         learned = isinstance(policy, NetworkPolicy)
@@ -74,9 +73,8 @@ def rollout(
 ) -> Episodes:
     """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
 
-    Some run side by side, each in its place; where they end, the next ones begin. What an episode
-    draws follows from the seed and its number alone. What a network or MJX computes may still
-    differ in the last bits. `on_progress` gets the episodes finished and all.
+    Some run side by side; where one ends, the next begins. An episode's draws follow from the seed
+    and its number alone. `on_progress` gets the episodes finished and all.
     """
     most = min(SIDE_BY_SIDE, episodes)
     if jax.default_backend() == "cpu":
@@ -171,7 +169,7 @@ class StepRecord(NamedTuple):
 
     before: State
     action: Action
-    joints: JointTrajectory  # how the robot moved
+    joints: JointTrajectory
     after: State
     reward: jax.Array  # [] R of CSAC eq. 12 for a learned policy; else `after.reward`
     debug: PolicyDebug | None  # of a learned policy
@@ -202,9 +200,10 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
         return StepRecord(state, action, joints, after, after.reward, None)
     key = jax.random.clone(key)  # the debug view is of the same draws
     debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
-    phi = {"phi_before": debug.best_grasp, "phi_after": later.best_grasp}  # the acting critic's
     paid = transitions.with_reward_outcome(policy.cfg.reward, after)
-    result = transitions.to_action_result(action, paid.info)._replace(**phi)
+    result = transitions.to_action_result(action, paid.info)
+    # By the critic that acts:
+    result = result._replace(phi_before=debug.best_grasp, phi_after=later.best_grasp)
     reward = rewards.reward(policy.cfg.reward, result)
     return StepRecord(state, action, joints, after, reward, debug)
 
@@ -222,9 +221,9 @@ def endings(env: Env, last: State) -> np.ndarray:
         "failed_grasps": last.failed_grasps >= (env.max_failures or np.inf),
         "action_cap": last.actions >= env.cfg.task.max_actions,
     }
-    held = jax.device_get([*reasons.values()])
-    numbers = [ENDINGS.index(name) for name in reasons]
-    return np.select(held, numbers, ENDINGS.index("no_change_cap")).astype(np.int32)
+    numbers = map(ENDINGS.index, (*reasons, "no_change_cap"))
+    *chosen, default = map(np.int32, numbers)
+    return np.select(jax.device_get([*reasons.values()]), chosen, default)
 
 
 def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: SceneState) -> State:
@@ -246,7 +245,8 @@ def _step(
     del kind
     running = ~states.done
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)
-    action = policies.act(policy, states, jax.vmap(jax.random.fold_in)(keys, numbers))
+    act = policy.batched if isinstance(policy, NetworkPolicy) else jax.vmap(policy)
+    action = act(states, jax.vmap(jax.random.fold_in)(keys, numbers))
     cleared = jax.vmap(scene_state.park)(states.scene, running[:, None] & states.scene.in_play)
     after = jax.vmap(env.step)(states.replace(scene=cleared), action)
     info, has_target = after.info, env.cfg.task.kind == "target"
