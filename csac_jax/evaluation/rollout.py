@@ -93,8 +93,8 @@ def rollout(
 
     numbers, actions = np.full(places, _NONE), np.zeros(places, int)
     states = jax.tree.map(lambda leaf: leaf[np.zeros(places, int)], begun(np.zeros(few, int)))
-    history: list[_Step] = []
-    waiting = np.arange(episodes)
+    completed, ending = np.zeros(episodes, bool), np.zeros(episodes, np.int32)
+    tables, waiting = None, np.arange(episodes)
     while np.any(numbers != _NONE) or waiting.size:
         free = np.flatnonzero(numbers == _NONE)[: waiting.size]
         for some in np.split(free, np.arange(few, free.size, few)):
@@ -104,48 +104,27 @@ def rollout(
                 here = np.pad(some, (0, few - some.size), constant_values=places)
                 states = _put(states, here, begun(np.resize(chosen, few)))
         states, record = step(type(policy), _pytree(policy), key, np.maximum(numbers, 0), states)
-        record, done = jax.device_get((record, states.done))
-        over = done & (numbers != _NONE)
-        terminated, ending = np.asarray(states.terminated), endings(env, states)
-        history.append(_Step(numbers, actions, record, over, terminated, ending))
-        numbers, actions = np.where(over, _NONE, numbers), actions + 1
+        record, done, terminated = jax.device_get((record, states.done, states.terminated))
+        busy = numbers != _NONE
+        over = numbers[busy & done]
+        completed[over], ending[over] = terminated[busy & done], endings(env, states)[busy & done]
+        tables = tables or _blank(record, episodes, env.cfg.task.max_actions)
+        for table, leaf in zip(jax.tree.leaves(tables), jax.tree.leaves(record), strict=True):
+            table[numbers[busy], actions[busy]] = leaf[busy]
+        numbers, actions = np.where(busy & done, _NONE, numbers), actions + 1
         if on_progress is not None:
             on_progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
-    return _joined(history, blocks, env.cfg)
+    assert tables is not None
+    lost = tables.blocks_lost.sum(axis=1)
+    blocks = np.ones_like(blocks) if env.cfg.task.kind == "target" else blocks
+    return tables._replace(blocks_lost=lost, blocks=blocks, completed=completed, ending=ending)
 
 
 _NONE = -1  # number of the episode in a place that is free
 
 
-class _Step(NamedTuple):
-    """One action of all parallel episodes; leaves [places], of several steps [S, places]."""
-
-    number: Any  # int, of the episode there
-    action: Any  # int, of that episode, from 0
-    record: Episodes
-    over: Any  # bool, the episode ended with it
-    terminated: Any  # bool
-    ending: Any  # int32, index into ENDINGS
-
-
-def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
-    """Sorts all steps into episodes; `blocks` [M] were in play at their start."""
-    steps = jax.tree.map(lambda *leaves: np.stack(leaves), *history)
-    held, order = steps.number != _NONE, np.argsort(steps.number[steps.over])
-    at = steps.number[held], steps.action[held]
-
-    def by_episode(leaf: np.ndarray) -> np.ndarray:
-        table = np.zeros((blocks.size, cfg.task.max_actions), leaf.dtype)
-        table[at] = leaf[held]
-        return table
-
-    records = jax.tree.map(by_episode, steps.record)
-    return records._replace(
-        blocks_lost=records.blocks_lost.sum(axis=1),
-        blocks=np.ones_like(blocks) if cfg.task.kind == "target" else blocks,
-        completed=steps.terminated[steps.over][order],
-        ending=steps.ending[steps.over][order],
-    )
+def _blank(record: Episodes, episodes: int, actions: int) -> Episodes:
+    return jax.tree.map(lambda leaf: np.zeros((episodes, actions), leaf.dtype), record)
 
 
 @jax.jit
