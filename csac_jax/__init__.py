@@ -12,17 +12,21 @@ The names in `__all__` are the public API; everything else may move without noti
 Map, in the direction of data; imports point only backwards along it:
 
     constants   numbers that several stages share
-    config      every setting, as frozen dataclasses
+    grippers    the hand and its numbers, as a value
+    section     frozen groups of settings; config: every setting
     runtime     compile cache, devices, signals, provenance; all of JAX that is private
-    presets     named configs; algorithms: the CSAC family and its baselines
+    algorithms  the CSAC family and its baselines, from config to config; presets: named configs
     geometry    poses, pixels <-> metres
-    objects     shapes of convex parts: libraries, own families, import of meshes
-    scene       MJCF -> model and index of ids; block layouts; the pool of settled scenes
-    sim         physics, push and grasp primitives, their outcomes
-    vision      raycaster, height and colour maps, rotations of maps
+    objects     convex parts: libraries, procedural families, import of meshes
+    robot       models of hand and arm, kinematics, push and grasp primitives
+    world       the state of a scene and its MuJoCo model
+    scenes      settled pools, packings, case files
+    sim         physics engines, outcomes of actions
+    vision      raycaster, height and colour maps, cameras
     nets        dense Q maps and action proposals
     agent       learner: cross-entropy method, targets, losses, rewards, exploration, update
     replay      ring of transitions and its samplers
+    baselines   an oracle, antipodal grasps
     env         reset and step of one scene
     io          checkpoints, policy files, configs
     training    the training step and its host loop
@@ -78,34 +82,10 @@ _HOMES = {
     "csac_jax.vision.heightmap": ("Observation", "unpack"),
 }
 
-__all__ = [
-    "Action",
-    "AutoResetEnv",
-    "Callback",
-    "Config",
-    "Env",
-    "Learner",
-    "Observation",
-    "Policy",
-    "Record",
-    "Run",
-    "Sample",
-    "Sampler",
-    "State",
-    "Transition",
-    "UpdateInfo",
-    "algorithms",
-    "deploy",
-    "evaluate",
-    "load_config",
-    "load_policy",
-    "make_env",
-    "presets",
-    "sweep",
-    "train",
-    "train_fn",
-    "unpack",
-]
+__all__ = ["Action", "AutoResetEnv", "Callback", "Config", "Env", "Learner", "Observation"]
+__all__ += ["Policy", "Record", "Run", "Sample", "Sampler", "State", "Transition", "UpdateInfo"]
+__all__ += ["algorithms", "deploy", "evaluate", "load_config", "load_policy", "make_env"]
+__all__ += ["presets", "sweep", "train", "train_fn", "unpack"]
 
 _guard.refuse_broken_jax()
 _guard.switch_off_broken_fusion()
@@ -114,7 +94,7 @@ _guard.widen_thread_pool()
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for."""
+    """Imports a public name when it is first asked for."""
     for home, names in _HOMES.items():
         if name in names:
             if home == "csac_jax":

@@ -4,12 +4,10 @@
 2. So do 0.10.1 and earlier in a plainer case: with M 3 x 3, `vmap(sum(M @ row))` is wrong in every
    row beyond the 32,768th, up to some 40,000 rows. An XLA flag switches that fusion off.
 3. Batched MJX runs many batched Cholesky factorisations. In jaxlib 0.10 they wait for one another
-   in the thread pool and hang for ever if it is small: on 2 cores, two at once are enough. A larger
-   pool cures it at no cost. Its size is read once, when the CPU client starts. Virtual devices
-   (`DEVICES_FLAG`) share one pool.
+   in the thread pool and hang for ever if it is small. A larger pool cures it at no cost. Its size
+   is read once, when the CPU client starts. Virtual devices (`DEVICES_FLAG`) share one pool.
 4. jaxlib 0.11 ends the process as it compiles a `shard_map` with a constant of no elements, and
-   MJX's models have many. The fault is a pattern of Shardy, the default partitioner, seen on CPU
-   devices; programs on several GPUs ended alike. The partitioner before Shardy compiles it.
+   MJX's models have many. The fault is Shardy's; the partitioner before it compiles them.
 """
 
 import importlib.metadata
@@ -64,7 +62,7 @@ def widen_thread_pool() -> None:
 
 
 def needed_threads() -> int:
-    """Returns how many threads batched MJX needs, by the number of XLA's virtual devices."""
+    """Returns the threads that batched MJX needs, by the number of XLA's virtual devices."""
     counts = re.findall(rf"{DEVICES_FLAG}=(\d+)", os.environ.get("XLA_FLAGS", "")) or ["1"]
     return max(MIN_THREADS, DEVICE_THREADS * int(counts[-1]))
 

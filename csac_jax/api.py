@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -76,9 +77,8 @@ def train(
     "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121 as
     .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of your
     own, which a resumed run needs again. callbacks, each a `Callback` or a function of the `Record`
-    of each chunk. eval_every, actions between evaluations of the policy of now, in eval_episodes
-    episodes of eval_suite, see `evaluate`, with the best state saved, see `load_policy`. A resumed
-    run continues them.
+    of each chunk. eval_every, actions between evaluations in eval_episodes episodes of eval_suite,
+    see `evaluate`, with the best state saved, see `load_policy`; a resumed run continues them.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
@@ -94,12 +94,11 @@ def train(
     with Terminal(Console(quiet=not verbose)) as terminal:
         terminal.log(_first_line(folder, cfg))
         program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
-        cached = learner is None and sampler is None and network is None
+        cached = (learner, sampler, network) == (None, None, None)
         follower = followers.joined(callbacks)
         if plan is not None:
-            inputs = (cfg, plan, follower, terminal.log, network, learner)
-            follower = followers.joined([follower, _checked(monitor.Monitor, *inputs)])
-
+            watch = monitor.Monitor(cfg, plan, follower, terminal.log, network, learner)
+            follower = followers.joined([follower, watch])
         begin = programs.compile_init(program)
 
         def first_state() -> TrainState:
@@ -107,16 +106,10 @@ def train(
             programs.prepare(program)
             return state if start is None else state.replace(learner=start(state.learner))
 
+        compile_chunk = functools.partial(split_step.compile_chunk, program, cached=cached)
+        stop = stop or signals.Stop()
         summary = loop.run(
-            cfg,
-            folder,
-            first_state,
-            lambda num_steps: split_step.compile_chunk(program, num_steps, cached),
-            terminal,
-            stop or signals.Stop(),
-            resume=resume,
-            at=at,
-            callback=follower,
+            cfg, folder, first_state, compile_chunk, terminal, stop, resume, at, follower
         )
     return Run(folder, cfg, summary, {"network": network, "learner": learner})
 
@@ -165,10 +158,8 @@ def sweep(
     """
     points = _points(cfg, dict(vary or {}))
     runner.check_plan(SweepPlan(seeds, points, episodes))
-    runs = seeds * len(points)
-    points = [
-        point._replace(cfg=backend.resolve(point.cfg, devices or 1, runs)) for point in points
-    ]
+    place = devices or 1, seeds * len(points)
+    points = [point._replace(cfg=backend.resolve(point.cfg, *place)) for point in points]
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
     plan = SweepPlan(seeds, points, episodes)
     return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
@@ -227,19 +218,17 @@ def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], 
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):
-        trunk = _checked(weights.read, cfg.net, Path(source))
+        trunk = weights.read(cfg.net, Path(source))
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
     assert isinstance(policy, NetworkPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
-    only_last = policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour
-    if only_last:  # inputs may be missing: colours, heights, gripper and target are in this order
+    # Inputs may be missing at the end: colours, heights, gripper and target are in this order.
+    if policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour:
         params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
-        raise SettingsError(
-            f"init {source}: its networks are not those of these settings; "
-            "take other net, learn.critics or task.kind"
-        )
+        fault = "its networks are not those of these settings"
+        raise SettingsError(f"init {source}: {fault}; take other net, learn.critics or task.kind")
     return lambda state: actor_critic.with_params(state, params)
 
 
@@ -263,19 +252,10 @@ def new_folder(name: str) -> Path:
 
 
 def _eval_plan(folder: Path, resume: bool, plan: EvalPlan) -> EvalPlan | None:
-    """Returns the plan if it evaluates at all, else that of the run that is resumed, if any."""
     if not plan.every:
         return monitor.read_plan(folder) if resume else None
-    _checked(plan.check)
+    plan.check()
     return plan
-
-
-def _checked(call: Callable[..., Any], *args: Any) -> Any:
-    """Returns what `call` returns; turns its ValueErrors into SettingsErrors."""
-    try:
-        return call(*args)
-    except ValueError as error:
-        raise SettingsError(str(error)) from None
 
 
 def _is_weights(source: str | Path) -> bool:
@@ -295,13 +275,12 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
         base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
         return programs.replace_settings(base, settings)
 
-    points: list[SweepPoint] = _checked(grid.combine, vary, configure)
-    return points
+    return grid.combine(vary, configure)
 
 
 def _first_line(folder: Path, cfg: Config) -> str:
+    settings = f"preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}"
     scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
     return (
-        f"run {folder}: preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}, {scenes}, "
-        f"physics {cfg.sim.physics}, on {provenance.device()}"
+        f"run {folder}: {settings}, {scenes}, physics {cfg.sim.physics}, on {provenance.device()}"
     )

@@ -21,10 +21,8 @@ block.
 `pushes_per_episode`           pushes / episodes.
 
 The first two efficiencies are no shares: a grasp that lifts two blocks takes both, so they can
-exceed 1. A metric that does not charge for pushes never stands alone where methods are compared.
-
-`failures` are shares too, see `_failures`. `outcomes` counts grasps by outcome. `counts` holds
-episodes, blocks, pushes, grasps, and blocks taken and lost.
+exceed 1. `failures` are shares too, see `_failures`. `outcomes` counts grasps by outcome. `counts`
+holds episodes, blocks, pushes, grasps, and blocks taken and lost.
 """
 
 import statistics
@@ -34,9 +32,7 @@ import numpy as np
 
 from csac_jax.constants import OUTCOMES, Outcome, Primitive
 
-ENDINGS = (  # why an episode ended
-    *("terminated", "action_cap", "no_change_cap", "physics_diverged", "failed_grasps"),
-)
+ENDINGS = ("terminated", "action_cap", "no_change_cap", "physics_diverged", "failed_grasps")
 PER_ACTION = ("action_efficiency", "action_efficiency_completed")  # blocks per action, no shares
 PER_EPISODE = ("actions_per_episode", "pushes_per_episode")  # counts, no shares
 NO_CASES = {"value": None, "low": None, "high": None, "n": 0}
@@ -61,7 +57,7 @@ class Episodes(NamedTuple):
 
 
 def wilson(successes: int, n: int) -> dict[str, Any]:
-    """Returns a share with Wilson's 95 % interval, which holds for few cases and near 0 and 1."""
+    """Returns a share with Wilson's 95 % interval."""
     return _wilson(successes / n, n, n) if n else dict(NO_CASES)
 
 
@@ -72,10 +68,10 @@ def clustered(hits: np.ndarray, cases: np.ndarray) -> dict[str, Any]:
     effect (Kish, Survey Sampling, 1965), the variance of the ratio between episodes over that of
     independent cases, at least 1. One object that cannot be grasped fails many grasps in a row.
     """
-    total, episodes = int(cases.sum()), np.count_nonzero(cases)
-    if total == 0:
+    if (total := int(cases.sum())) == 0:
         return dict(NO_CASES)
     share = float(hits.sum()) / total
+    episodes = np.count_nonzero(cases)
     between = np.square(hits - share * cases).sum() * episodes / max(episodes - 1, 1)
     effect = max(1.0, between / (total * share * (1.0 - share))) if 0.0 < share < 1.0 else 1.0
     return _wilson(share, total, total / effect)
@@ -91,10 +87,7 @@ def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
 
 
 def bootstrap_ratio(above: np.ndarray, below: np.ndarray, n: int, seed: int = 0) -> dict[str, Any]:
-    """Returns sum(above) / sum(below) over cases [M], with a 95 % percentile bootstrap interval.
-
-    `n` is reported as the number of cases. `scipy.stats.bootstrap` refuses a single case.
-    """
+    """Returns sum(above) / sum(below) over cases [M], with a 95 % percentile bootstrap interval."""
     if below.sum() == 0:
         return dict(NO_CASES)
     drawn = np.random.default_rng(seed).integers(0, above.size, (RESAMPLES, above.size))
@@ -139,23 +132,22 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:
-    """Averages a value per episode [M]."""
     return bootstrap_ratio(values, np.ones(values.shape), values.size)
 
 
 def _share(true: np.ndarray, of: np.ndarray | None = None) -> dict[str, Any]:
-    """Returns the share of episodes [M], or of the actions `of` [M, T], in which `true` holds."""
+    """Returns the share of episodes [M], or of actions `of` [M, T], in which `true` holds."""
     if of is None:
         return wilson(int(true.sum()), true.size)
     return clustered((true & of).sum(axis=1), of.sum(axis=1))
 
 
 def _failures(episodes: Episodes, grasps: np.ndarray) -> dict[str, dict[str, Any]]:
-    """Counts failures by cause; `grasps` [M, T] bool. An action has one cause; one out of reach
-    also has the outcome of an action that moves nothing."""
+    """Counts failures by cause; `grasps` [M, T] bool."""
     grasped = [_share(~episodes.wrong & (episodes.outcome == kind), grasps) for kind in Outcome]
     ended = {name: _share(episodes.ending == number) for number, name in enumerate(ENDINGS)}
-    return {  # of all grasps:
+    return {
+        # Of all grasps:
         "grasp_nothing": grasped[Outcome.NOTHING],  # at bare table
         "grasp_empty": grasped[Outcome.EMPTY],  # met no block, though there was one below
         "grasp_touched": grasped[Outcome.TOUCHED],  # met a block and did not lift it by 1 cm

@@ -37,10 +37,10 @@ class EvalPlan(NamedTuple):
     episodes: int = EVAL_EPISODES  # of every part of the suite
 
     def check(self) -> None:
-        """Raises ValueError for numbers that cannot be, and for an unknown suite."""
+        """Raises SettingsError for numbers that cannot be, and for an unknown suite."""
         for name, value in (("eval_every", self.every), ("eval_episodes", self.episodes)):
             if value < 1:
-                raise ValueError(f"{name}: must be at least 1, not {value}")
+                raise SettingsError(f"{name}: must be at least 1, not {value}")
         suites.check(self.suite)
 
 
@@ -56,14 +56,13 @@ class Monitor(Callback):
         network: Any = None,
         learner: Learner | None = None,
     ) -> None:
-        """Settles the scenes.
+        """Settles the scenes. Raises SettingsError for a suite that does not fit the policy.
 
         Args: callback, whose `evaluated` is called; log, takes a line about each evaluation;
-        network and learner, of a run with custom parts. Raises ValueError for a suite that does not
-        fit the policy.
+        network and learner, of a run with custom parts.
         """
         self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
-        self._cfg, self._plan, self._callback, self._log_line = cfg, plan, callback, log
+        self._cfg, self._plan, self._callback, self._log = cfg, plan, callback, log
         self._network, self._learner = network, learner
         self._best: Score = ()
         self._done = 0  # actions before the chunk that comes next
@@ -83,21 +82,21 @@ class Monitor(Callback):
             self._evaluate(record, state)
 
     def _evaluate(self, record: Record, state: Any) -> None:
-        begun, plan = time.time(), self._plan
+        begun, folder = time.time(), self._run_dir / files.BEST
         policy = policies.policy_from_state(self._cfg, state.learner, self._network, self._learner)
         table = rollout.evaluate(policy, self._suite)
         score = score_of(table)
         if best := score > self._best:
-            self._best, place = score, self._run_dir / files.BEST
+            self._best = score
             extra = {"seconds": record.seconds, "grasps": [], "score": score}
-            checkpoint.save(place, record.step, state, self._cfg, extra)
-        self._log(record, round(time.time() - begun, 3), score, best, table)
+            checkpoint.save(folder, record.step, state, self._cfg, extra)
+        self._write(record, round(time.time() - begun, 3), score, best, table)
         values = [f"{name} {value:.1%}" for name, value in zip(JUDGED, score, strict=True)]
-        line = f"evaluated on {plan.suite} at {record.actions} actions: {', '.join(values)}"
-        self._log_line(line.replace("_", " ") + ", the best so far" * best)
+        line = f"evaluated on {self._plan.suite} at {record.actions} actions: {', '.join(values)}"
+        self._log(line.replace("_", " ") + ", the best so far" * best)
         self._callback.evaluated(record, table)
 
-    def _log(
+    def _write(
         self, record: Record, seconds: float, score: Score, best: bool, table: dict[str, Any]
     ) -> None:
         """Adds a line to the log, with all that `files.read_log` requires."""
@@ -134,10 +133,13 @@ def score_of(table: dict[str, Any]) -> Score:
     return tuple(sum(part[name]["value"] or 0.0 for part in parts) / len(parts) for name in JUDGED)
 
 
+def _parts(table: dict[str, Any]) -> list[dict[str, Any]]:
+    return list(table.get("parts", {"": table}).values())
+
+
 def read_plan(run_dir: Path) -> EvalPlan | None:
     """Reads the evaluation plan of a run; None if it has none. Raises SettingsError."""
-    path = run_dir / PLAN
-    if not path.exists():
+    if not (path := run_dir / PLAN).exists():
         return None
     try:
         plan = EvalPlan(**files.read_object(path))
@@ -146,7 +148,3 @@ def read_plan(run_dir: Path) -> EvalPlan | None:
         fault = files.first_line(error)
         raise SettingsError(f"{path} is damaged ({fault}); remove it, or give eval_every") from None
     return plan
-
-
-def _parts(table: dict[str, Any]) -> list[dict[str, Any]]:
-    return list(table["parts"].values()) if "parts" in table else [table]

@@ -53,34 +53,30 @@ class NetworkPolicy:
 
     cfg: Config = struct.field(pytree_node=False)
     params: Params
-    network: Any = struct.field(pytree_node=False, default=None)  # a critic of one's own
+    network: Any = struct.field(pytree_node=False, default=None)  # a custom critic
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        actions = self.batched(*jax.tree.map(lambda leaf: leaf[None], (scene, key)))
-        return jax.tree.map(lambda leaf: leaf[0], actions)
+        return _first(self.batched(*_alone((scene, key))))
 
     def batched(self, scenes: Observation | State, keys: jax.Array) -> Action:
         """Chooses actions, leaves [E], for scenes, leaves [E, ...], and keys [E]. The networks see
         groups of scenes that fit the memory; under vmap they would see all."""
-        parts, (obs, unchanged) = actor_critic.make(self.cfg, self.network), _seen(scenes)
+        parts, (obs, unchanged, failed) = actor_critic.make(self.cfg, self.network), _seen(scenes)
         dense_maps = values.decision_maps(parts, self.params, obs)
-        each = keys, parts, dense_maps, _failed(scenes)
-        dense_maps = jax.vmap(policy.after_failures, (0, None, 0, 0))(*each)
+        retried = jax.vmap(policy.after_failures, (0, None, 0, 0))
+        dense_maps = retried(keys, parts, dense_maps, failed)
         return jax.vmap(policy.best_action, (0, None, 0, 0))(keys, parts, dense_maps, unchanged)
 
     @jax.jit
     def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
         """Returns the values behind the action in this scene with this key."""
-        parts = actor_critic.make(self.cfg, self.network)
-        obs = jax.tree.map(lambda leaf: leaf[None], _seen(scene)[0])
-        batch = values.decision_maps(parts, self.params, obs)
-        dense_maps = jax.tree.map(lambda leaf: leaf[0], batch)
+        parts, (obs, _, failed) = actor_critic.make(self.cfg, self.network), _seen(scene)
+        dense_maps = _first(values.decision_maps(parts, self.params, _alone(obs)))
         places = geometry.cell_centres(self.cfg.heightmap)
         q = maps.best_over_yaws(parts.frames, dense_maps, places)
-        candidates = policy.candidates(
-            key, parts, policy.after_failures(key, parts, dense_maps, _failed(scene))
-        )
+        retried = policy.after_failures(key, parts, dense_maps, failed)
+        candidates = policy.candidates(key, parts, retried)
         return PolicyDebug(q, candidates, values.best_grasp(dense_maps))
 
 
@@ -94,9 +90,8 @@ class CustomLearnerPolicy:
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        obs, unchanged = jax.tree.map(lambda leaf: leaf[None], _seen(scene))
-        actions = self.learner.act(key, self.state, obs, unchanged)
-        return jax.tree.map(lambda leaf: leaf[0], actions)
+        obs, unchanged, _ = _alone(_seen(scene))
+        return _first(self.learner.act(key, self.state, obs, unchanged))
 
 
 @struct.dataclass
@@ -124,10 +119,8 @@ class OraclePolicy:
         if not isinstance(scene, State):
             raise TypeError("the oracle reads the blocks' poses: give it a State, no Observation")
         # The same scene would have the same grasp fail again; a little turn is no change to see.
-        failed = (scene.actions > 0) & (scene.info.cleared == 0)
-        failures = jnp.where(
-            failed, jnp.maximum(scene.steps_without_change, 1 + scene.actions % 2), 0
-        )
+        turned = jnp.maximum(scene.steps_without_change, 1 + scene.actions % 2)
+        failures = jnp.where(_without_lift(scene), turned, 0)
         return oracle.grasp(self.cfg, scene.scene, scene.obs.height, failures)
 
 
@@ -140,41 +133,39 @@ class GeometricPolicy:
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
-        obs, failures = _seen(scene)
+        obs, failures, _ = _seen(scene)
         if isinstance(scene, State):  # it may have moved without being lifted
-            failed = (scene.actions > 0) & (scene.info.cleared == 0)
-            failures = jnp.maximum(failures, jnp.int32(failed))
+            failures = jnp.maximum(failures, jnp.int32(_without_lift(scene)))
         return antipodal.grasp(key, self.cfg, obs.height, obs.target, failures, self.weights)
 
 
-def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array]:
-    """Returns observations, and actions in a row without change [...], 0 for a bare observation."""
-    if isinstance(scenes, State):
-        return scenes.obs, scenes.steps_without_change
-    return scenes, jnp.zeros(scenes.height.shape[:-2], jnp.int32)
+def _alone(tree: Any) -> Any:
+    """Makes a batch of one, leaves [1, ...]."""
+    return jax.tree.map(lambda leaf: leaf[None], tree)
 
 
-def _failed(scenes: Observation | State) -> jax.Array:
-    """Counts failed grasps in a row [...], 0 for a bare observation."""
+def _first(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[0], tree)
+
+
+def _seen(scenes: Observation | State) -> tuple[Observation, jax.Array, jax.Array]:
+    """Returns observations, and actions without change and failed grasps in a row [...], both 0 for
+    a bare observation."""
     if isinstance(scenes, State):
-        return scenes.failed_grasps
-    return jnp.zeros(scenes.height.shape[:-2], jnp.int32)
+        return scenes.obs, scenes.steps_without_change, scenes.failed_grasps
+    zero = jnp.zeros(scenes.height.shape[:-2], jnp.int32)
+    return scenes, zero, zero
+
+
+def _without_lift(scene: State) -> jax.Array:
+    """Returns True where the last action took no block, [] bool."""
+    return (scene.actions > 0) & (scene.info.cleared == 0)
 
 
 def in_world(policy: Policy, cfg: Config) -> Policy:
     """Gives a policy the config of an environment; a custom policy stays as it is."""
-    if isinstance(
-        policy, NetworkPolicy | CustomLearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
-    ):
-        return dataclasses.replace(policy, cfg=cfg)
-    return policy
-
-
-def act(policy: Policy, states: State, keys: jax.Array) -> Action:
-    """Chooses actions, leaves [E], of a policy in states, leaves [E, ...], with keys [E]."""
-    if isinstance(policy, NetworkPolicy):
-        return policy.batched(states, keys)
-    return jax.vmap(policy)(states, keys)
+    ours = NetworkPolicy | CustomLearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
+    return dataclasses.replace(policy, cfg=cfg) if isinstance(policy, ours) else policy
 
 
 def load_config(source: str | Path, which: Which = "last") -> Config:
@@ -224,11 +215,9 @@ def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
 
 
 def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
-    """Makes the policy of a kind: `learned`, the networks of `source`; or a name of `BASELINES` or
-    `MODULE:NAME`, a callable that makes a policy from the config of `source`, see `load`.
-
-    Raises ValueError for an unknown kind, and as `load`.
-    """
+    """Makes the policy of a kind: `learned`, the networks of `source`, see `load`; or a name of
+    `BASELINES` or `MODULE:NAME`, a callable that takes the config of `source`. Raises ValueError
+    for an unknown kind."""
     if kind == "learned":
         return load(source, which=which)
     if kind not in BASELINES and ":" not in kind:

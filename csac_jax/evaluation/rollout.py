@@ -46,9 +46,8 @@ def evaluate(
     """Measures a policy in scenes that training never saw; the metrics are `metrics`'.
 
     Args: suite, a name of `suites.SUITES`, a case file, or a suite prepared by `suites.prepare`,
-    which holds the other arguments; on_progress, called after every action; for the rest see
-    `suites.prepare`. Returns: the metrics; of a suite with several parts {"parts": {name:
-    metrics}}. Raises ValueError as `suites.prepare`.
+    which has the other arguments; on_progress, called after every action. Returns: the metrics; of
+    a suite with several parts {"parts": {name: metrics}}. Raises ValueError as `suites.prepare`.
     """
     if not isinstance(suite, PreparedSuite):
         learned = isinstance(policy, NetworkPolicy)
@@ -74,9 +73,8 @@ def rollout(
 ) -> Episodes:
     """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
 
-    Some run side by side, each in its place; where they end, the next ones begin. What an episode
-    draws follows from the seed and its number alone. What a network or MJX computes may still
-    differ in the last bits. `on_progress` gets the episodes finished and all.
+    Some run side by side; where one ends, the next begins. An episode's draws follow from the seed
+    and its number alone. `on_progress` gets the episodes finished and all.
     """
     most = min(SIDE_BY_SIDE, episodes)
     if jax.default_backend() == "cpu":
@@ -95,8 +93,8 @@ def rollout(
 
     numbers, actions = np.full(places, _NONE), np.zeros(places, int)
     states = jax.tree.map(lambda leaf: leaf[np.zeros(places, int)], begun(np.zeros(few, int)))
-    history: list[_Step] = []
-    waiting = np.arange(episodes)
+    completed, ending = np.zeros(episodes, bool), np.zeros(episodes, np.int32)
+    tables, waiting = None, np.arange(episodes)
     while np.any(numbers != _NONE) or waiting.size:
         free = np.flatnonzero(numbers == _NONE)[: waiting.size]
         for some in np.split(free, np.arange(few, free.size, few)):
@@ -106,48 +104,27 @@ def rollout(
                 here = np.pad(some, (0, few - some.size), constant_values=places)
                 states = _put(states, here, begun(np.resize(chosen, few)))
         states, record = step(type(policy), _pytree(policy), key, np.maximum(numbers, 0), states)
-        record, done = jax.device_get((record, states.done))
-        over = done & (numbers != _NONE)
-        terminated, ending = np.asarray(states.terminated), endings(env, states)
-        history.append(_Step(numbers, actions, record, over, terminated, ending))
-        numbers, actions = np.where(over, _NONE, numbers), actions + 1
+        record, done, terminated = jax.device_get((record, states.done, states.terminated))
+        busy = numbers != _NONE
+        over = numbers[busy & done]
+        completed[over], ending[over] = terminated[busy & done], endings(env, states)[busy & done]
+        tables = tables or _blank(record, episodes, env.cfg.task.max_actions)
+        for table, leaf in zip(jax.tree.leaves(tables), jax.tree.leaves(record), strict=True):
+            table[numbers[busy], actions[busy]] = leaf[busy]
+        numbers, actions = np.where(busy & done, _NONE, numbers), actions + 1
         if on_progress is not None:
             on_progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
-    return _joined(history, blocks, env.cfg)
+    assert tables is not None
+    lost = tables.blocks_lost.sum(axis=1)
+    blocks = np.ones_like(blocks) if env.cfg.task.kind == "target" else blocks
+    return tables._replace(blocks_lost=lost, blocks=blocks, completed=completed, ending=ending)
 
 
 _NONE = -1  # number of the episode in a place that is free
 
 
-class _Step(NamedTuple):
-    """One action of all parallel episodes; leaves [places], of several steps [S, places]."""
-
-    number: Any  # int, of the episode there
-    action: Any  # int, of that episode, from 0
-    record: Episodes
-    over: Any  # bool, the episode ended with it
-    terminated: Any  # bool
-    ending: Any  # int32, index into ENDINGS
-
-
-def _joined(history: list[_Step], blocks: np.ndarray, cfg: Config) -> Episodes:
-    """Sorts all steps into episodes; `blocks` [M] were in play at their start."""
-    steps = jax.tree.map(lambda *leaves: np.stack(leaves), *history)
-    held, order = steps.number != _NONE, np.argsort(steps.number[steps.over])
-    at = steps.number[held], steps.action[held]
-
-    def by_episode(leaf: np.ndarray) -> np.ndarray:
-        table = np.zeros((blocks.size, cfg.task.max_actions), leaf.dtype)
-        table[at] = leaf[held]
-        return table
-
-    records = jax.tree.map(by_episode, steps.record)
-    return records._replace(
-        blocks_lost=records.blocks_lost.sum(axis=1),
-        blocks=np.ones_like(blocks) if cfg.task.kind == "target" else blocks,
-        completed=steps.terminated[steps.over][order],
-        ending=steps.ending[steps.over][order],
-    )
+def _blank(record: Episodes, episodes: int, actions: int) -> Episodes:
+    return jax.tree.map(lambda leaf: np.zeros((episodes, actions), leaf.dtype), record)
 
 
 @jax.jit
@@ -171,7 +148,7 @@ class StepRecord(NamedTuple):
 
     before: State
     action: Action
-    joints: JointTrajectory  # how the robot moved
+    joints: JointTrajectory
     after: State
     reward: jax.Array  # [] R of CSAC eq. 12 for a learned policy; else `after.reward`
     debug: PolicyDebug | None  # of a learned policy
@@ -202,9 +179,10 @@ def _recorded_step(env: Env, policy: Policy, key: jax.Array, state: State) -> St
         return StepRecord(state, action, joints, after, after.reward, None)
     key = jax.random.clone(key)  # the debug view is of the same draws
     debug, later = policy.debug(state, key), policy.debug(after, jax.random.clone(key))
-    phi = {"phi_before": debug.best_grasp, "phi_after": later.best_grasp}  # the acting critic's
     paid = transitions.with_reward_outcome(policy.cfg.reward, after)
-    result = transitions.to_action_result(action, paid.info)._replace(**phi)
+    result = transitions.to_action_result(action, paid.info)
+    # By the critic that acts:
+    result = result._replace(phi_before=debug.best_grasp, phi_after=later.best_grasp)
     reward = rewards.reward(policy.cfg.reward, result)
     return StepRecord(state, action, joints, after, reward, debug)
 
@@ -222,9 +200,9 @@ def endings(env: Env, last: State) -> np.ndarray:
         "failed_grasps": last.failed_grasps >= (env.max_failures or np.inf),
         "action_cap": last.actions >= env.cfg.task.max_actions,
     }
-    held = jax.device_get([*reasons.values()])
-    numbers = [ENDINGS.index(name) for name in reasons]
-    return np.select(held, numbers, ENDINGS.index("no_change_cap")).astype(np.int32)
+    numbers = map(ENDINGS.index, (*reasons, "no_change_cap"))
+    *chosen, default = map(np.int32, numbers)
+    return np.select(jax.device_get([*reasons.values()]), chosen, default)
 
 
 def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: SceneState) -> State:
@@ -246,7 +224,8 @@ def _step(
     del kind
     running = ~states.done
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)
-    action = policies.act(policy, states, jax.vmap(jax.random.fold_in)(keys, numbers))
+    act = policy.batched if isinstance(policy, NetworkPolicy) else jax.vmap(policy)
+    action = act(states, jax.vmap(jax.random.fold_in)(keys, numbers))
     cleared = jax.vmap(scene_state.park)(states.scene, running[:, None] & states.scene.in_play)
     after = jax.vmap(env.step)(states.replace(scene=cleared), action)
     info, has_target = after.info, env.cfg.task.kind == "target"

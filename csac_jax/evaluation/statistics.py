@@ -36,33 +36,18 @@ def band(strata: Sequence[Stratum], seed: int = 0) -> Band:
     Unlike Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out
     the hardest. Raises ValueError where a stratum is empty.
     """
-    fewest = min(map(len, strata), default=0)
-    if fewest == 0:
-        raise ValueError("no values to take a mean of")
-    if fewest == 1:
-        return Band(float(_mean_iqm(*map(_seed_means, strata))), None, None, 1)
-    return _bootstrapped(strata, _mean_iqm, seed)
+    return _bands(strata, _mean_iqm, seed)[0]
 
 
 def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> Band:
     """Subtracts the `band` of theirs from that of ours, seeds drawn independently; strata in the
     same order. Raises ValueError where one has fewer than two seeds."""
-    _check_pair(ours, theirs)
-
-    def gap(*strata: np.ndarray) -> np.ndarray:
-        return _mean_iqm(*strata[: len(ours)]) - _mean_iqm(*strata[len(ours) :])
-
-    return _bootstrapped((*ours, *theirs), gap, seed)
+    return _bands(_pair(ours, theirs), _gap, seed)[0]
 
 
 def p_value(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> float:
-    """Returns the two-sided bootstrap p-value of no `difference`, from the same draws.
-
-    Raises ValueError as `difference`.
-    """
-    _check_pair(ours, theirs)
-    draws = _draws((*ours, *theirs), seed)
-    gaps = _mean_iqm(*draws[: len(ours)]) - _mean_iqm(*draws[len(ours) :])
+    """Returns the two-sided bootstrap p-value of no `difference`, from the same draws."""
+    gaps = _gap(*_draws(_pair(ours, theirs), seed))
     rarer = min(np.sum(gaps <= 0.0), np.sum(gaps >= 0.0))
     return min(2.0 * (1.0 + float(rarer)) / (1.0 + len(gaps)), 1.0)
 
@@ -73,31 +58,23 @@ def improvement(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 
     P = mean over strata of mean over pairs of (x > y) + (x = y) / 2, Agarwal et al. sec. 4.3: the
     Mann-Whitney U over the number of pairs. Raises ValueError as `difference`.
     """
-    _check_pair(ours, theirs)
 
     def probability(*strata: np.ndarray) -> np.ndarray:
-        pairs = zip(strata[: len(ours)], strata[len(ours) :], strict=True)
-        return np.mean([_above(x, y) for x, y in pairs], axis=0)
+        half = len(strata) // 2
+        return np.mean(list(map(_above, strata[:half], strata[half:])), axis=0)
 
-    return _bootstrapped((*ours, *theirs), probability, seed)
+    return _bands(_pair(ours, theirs), probability, seed)[0]
 
 
 def profile(strata: Sequence[Stratum], thresholds: np.ndarray, seed: int = 0) -> list[Band]:
     """Returns the share of the seeds above each threshold [m], mean over strata: the performance
     profile of Agarwal et al. sec. 4.2. Raises ValueError where a stratum is empty."""
-    if min(map(len, strata), default=0) == 0:
-        raise ValueError("no values to take a share of")
 
     def shares(*strata: np.ndarray) -> np.ndarray:
         above = [np.mean(values[..., None] > thresholds, axis=-2) for values in strata]
         return np.mean(above, axis=0)  # [..., m]
 
-    values, fewest = shares(*map(_seed_means, strata)), min(map(len, strata))
-    if fewest == 1:
-        return [Band(float(value), None, None, 1) for value in values]
-    low, high = np.percentile(shares(*_draws(strata, seed)), [2.5, 97.5], axis=0)
-    rows = zip(values.tolist(), low.tolist(), high.tolist(), strict=True)
-    return [Band(*row, fewest) for row in rows]
+    return _bands(strata, shares, seed)
 
 
 def curves(
@@ -119,20 +96,26 @@ def area(x: np.ndarray, y: np.ndarray, end: float) -> float:
     return float(np.trapezoid(np.interp(places, x, y), places) / end)
 
 
-def _check_pair(ours: Sequence[Stratum], theirs: Sequence[Stratum]) -> None:
-    if min(map(len, (*ours, *theirs)), default=0) < 2:
-        raise ValueError("a difference needs two values of each")
+def _pair(ours: Sequence[Stratum], theirs: Sequence[Stratum]) -> tuple[Stratum, ...]:
+    if len(ours) != len(theirs) or min(map(len, (*ours, *theirs)), default=0) < 2:
+        raise ValueError("a difference needs the same strata and two values of each")
+    return (*ours, *theirs)
+
+
+def _gap(*strata: np.ndarray) -> np.ndarray:
+    half = len(strata) // 2
+    return _mean_iqm(*strata[:half]) - _mean_iqm(*strata[half:])
 
 
 def _mean_iqm(*strata: np.ndarray) -> np.ndarray:
     """Averages over strata the IQM over the last axis: a quarter of the values, rounded down, is
     cut at either end. As SciPy's `trim_mean`, which takes five times as long."""
-    cuts = [values.shape[-1] // 4 for values in strata]
-    middles = [
-        np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut]
-        for values, cut in zip(strata, cuts, strict=True)
-    ]
-    return np.mean([middle.mean(axis=-1) for middle in middles], axis=0)
+
+    def iqm(values: np.ndarray) -> np.ndarray:
+        cut = values.shape[-1] // 4
+        return np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut].mean(axis=-1)
+
+    return np.mean(list(map(iqm, strata)), axis=0)
 
 
 def _above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -142,22 +125,24 @@ def _above(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return ((x > y).sum(axes) + 0.5 * (x == y).sum(axes)) / pairs
 
 
-def _seed_means(stratum: Stratum) -> np.ndarray:
-    """Averages each seed's hosts, [seeds]."""
-    return np.array([np.mean(one) for one in stratum], float)
-
-
-def _bootstrapped(strata: Sequence[Stratum], statistic: Callable, seed: int) -> Band:
-    """Bootstraps a statistic of strata, arrays [..., seeds] -> [...]; band of 95 % percentiles."""
-    value = statistic(*map(_seed_means, strata))
-    low, high = np.percentile(statistic(*_draws(strata, seed)), [2.5, 97.5])
-    return Band(float(value), float(low), float(high), min(map(len, strata)))
+def _bands(strata: Sequence[Stratum], statistic: Callable, seed: int) -> list[Band]:
+    """Bootstraps a statistic of strata, arrays [..., seeds] -> [...] or [..., m]; 95 % bands."""
+    fewest = min(map(len, strata), default=0)
+    if fewest == 0:
+        raise ValueError("no values to take a mean of")
+    means = [np.array([np.mean(hosts) for hosts in stratum], float) for stratum in strata]
+    values = np.atleast_1d(statistic(*means)).tolist()
+    if fewest == 1:
+        return [Band(value, None, None, 1) for value in values]
+    low, high = np.percentile(statistic(*_draws(strata, seed)), [2.5, 97.5], axis=0)
+    rows = zip(values, np.atleast_1d(low).tolist(), np.atleast_1d(high).tolist(), strict=True)
+    return [Band(*row, fewest) for row in rows]
 
 
 def _draws(strata: Sequence[Stratum], seed: int) -> list[np.ndarray]:
     """Draws RESAMPLES times from each stratum, [RESAMPLES, seeds]."""
     rng = np.random.default_rng(seed)
-    return [_draw(rng, [np.atleast_1d(one) for one in stratum]) for stratum in strata]
+    return [_draw(rng, [np.atleast_1d(hosts) for hosts in stratum]) for stratum in strata]
 
 
 def _draw(rng: np.random.Generator, hosts: Sequence[np.ndarray]) -> np.ndarray:

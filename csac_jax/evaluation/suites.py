@@ -16,9 +16,9 @@
 a path             the user's case file.
 
 Suites of objects draw from the library of `scene.objects`; docs/benchmark.md defines them.
-Training draws from stream 0 of random numbers, a suite from stream 1 + seed; no case is in
-training. Dropped and drawn blocks have SceneConfig's default sizes and materials. Every scene is
-turned by a random yaw, or by quarters where another turn would take a block out of the workspace.
+Training draws from stream 0 of random numbers, a suite from stream 1 + seed. Dropped and drawn
+blocks have SceneConfig's default sizes and materials. Every scene is turned by a random yaw, or by
+quarters where another turn would take a block out of the workspace.
 """
 
 import dataclasses
@@ -43,6 +43,7 @@ from csac_jax.config import (
 )
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
+from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
 from csac_jax.scenes import arrange, cases, pool
 from csac_jax.sim import backend, physics as simulation
@@ -55,11 +56,9 @@ TEN: tuple[SlotKind, ...] = (  # blocks of random10, of all kinds
     *("cylinder", "half_cylinder", "box", "box", "box"),
 )
 TEN_CONTACTS = SimConfig(geom_pairs=24, contacts=80)
-THIRTY_CONTACTS = SimConfig(geom_pairs=72, contacts=240)
-TARGET_ACTIONS = 5  # CSAC sec. 4.4
+TARGET = {"kind": "target", "max_actions": 5}  # CSAC sec. 4.4
 FEW = 5  # objects of `pile` and `objects_packed` (VGN, arXiv:2101.01132)
 MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
-PILE_EXTENT, PACKED_EXTENT = 0.10, 0.30  # m, squares that their objects are placed in (VGN)
 ACTIONS_EACH = 5  # most actions for each object (ours): pushes do not count as failures
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
 
@@ -92,9 +91,9 @@ SUITES: dict[str, Suite] = {}
 def register(
     name: str, build: Build, episodes: int = 250, target: bool = False, objects: bool = False
 ) -> None:
-    """Adds a suite; see `Suite`. Raises ValueError for a name that is taken."""
+    """Adds a suite; see `Suite`. Raises SettingsError for a name that is taken."""
     if name in SUITES or name in RENAMED_SUITES:
-        raise ValueError(f"there is a suite '{name}' already; choose another name")
+        raise SettingsError(f"there is a suite '{name}' already; choose another name")
     SUITES[name] = Suite(build, episodes, target, objects)
 
 
@@ -113,9 +112,8 @@ def prepare(
 
     Args: suite, a name of `SUITES` or a case file; episodes, of every part; objects and split, the
     library of suites of objects, by default the config's; learned, False for a policy that needs no
-    training. Raises ValueError for an unknown suite, an unsound case file or one without the target
-    asked for, a library that is missing or not needed, and for a suite with targets where a learned
-    policy was trained without.
+    training. Raises SettingsError for a suite that is unknown, damaged or does not fit the policy,
+    and for a library that is missing or not needed.
     """
     check(suite)
     suite = RENAMED_SUITES.get(suite, suite)
@@ -123,35 +121,34 @@ def prepare(
     few = cfg.change(sim={"physics": physics, "robot": robot}, train={"scenes": 1})
     cfg = cfg.change(sim=backend.resolve(few).sim)  # `auto`: what suits a few scenes at a time
     if suite not in SUITES:
-        return PreparedSuite(
-            suite, cfg, {Path(suite).stem: _case(cfg, Path(suite))}, episodes, seed
-        )
-    if SUITES[suite].target and learned and cfg.task.kind != "target":
-        raise ValueError(
+        parts: Any = {Path(suite).stem: _case(cfg, Path(suite))}
+    elif SUITES[suite].target and learned and cfg.task.kind != "target":
+        raise SettingsError(
             f"suite: {suite} needs a policy trained with task.kind target, this one was trained to "
             "clear the table; choose another suite, or the policy oracle or random"
         )
-    parts = SUITES[suite].build(cfg, episodes, 1 + seed)
-    parts = parts if isinstance(parts, dict) else {suite: parts}
-    return PreparedSuite(suite, cfg, parts, episodes, seed)
+    else:
+        parts = SUITES[suite].build(cfg, episodes, 1 + seed)
+    return PreparedSuite(
+        suite, cfg, parts if isinstance(parts, dict) else {suite: parts}, episodes, seed
+    )
 
 
 def check(suite: str) -> None:
-    """Raises ValueError for a name that is neither a suite's nor a file's."""
+    """Raises SettingsError for a name that is neither a suite's nor a file's."""
     if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
         known = ", ".join(SUITES)
-        raise ValueError(f"suite: '{suite}' is neither a case file nor one of: {known}")
+        raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
 
 
 def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
     if suite not in SUITES or not SUITES[suite].objects:
         if objects is not None:
             names = ", ".join(name for name, entry in SUITES.items() if entry.objects)
-            raise ValueError(f"objects: '{suite}' has no objects of a library; {names} have")
+            raise SettingsError(f"objects: '{suite}' has no objects of a library; {names} have")
         return cfg
-    source = objects or cfg.scene.objects
-    if not source:
-        raise ValueError(
+    if not (source := objects or cfg.scene.objects):
+        raise SettingsError(
             f"objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
             "give procedural:0:200"
         )
@@ -159,16 +156,15 @@ def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) ->
     return cfg.change(scene=scene, sim={"physics": "auto"})
 
 
-def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
-    cfg = cfg.change(task={"kind": "target", "max_actions": TARGET_ACTIONS})
-    ten = _ten(cfg, episodes, stream)
-    return {**_cases(cfg), "random10": dataclasses.replace(ten, cfg=ten.cfg.change(task=cfg.task))}
-
-
 def _wide(cfg: Config, scene: SceneConfig, sim: SimConfig = TEN_CONTACTS) -> Config:
     """Replaces the blocks, and allows at least the contacts of `sim`."""
     pairs, contacts = max(cfg.sim.geom_pairs, sim.geom_pairs), max(cfg.sim.contacts, sim.contacts)
     return cfg.change(scene=scene, sim={"geom_pairs": pairs, "contacts": contacts})
+
+
+def _env(cfg: Config, scenes: SceneState, max_failures: int = 0) -> Env:
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    return Env(cfg, physics, scenes, max_failures=max_failures)
 
 
 def _dropped(cfg: Config, slots: tuple[SlotKind, ...], sim: SimConfig) -> Config:
@@ -183,12 +179,8 @@ def _ten(cfg: Config, episodes: int, stream: int) -> Env:
 
 
 def _thirty(cfg: Config, episodes: int, stream: int) -> Env:
-    cfg = _dropped(cfg, TEN * 3, THIRTY_CONTACTS)
-    return Env(cfg, _physics(cfg), pool.settled(cfg, stream, episodes, poured=True))
-
-
-def _physics(cfg: Config) -> simulation.Physics:
-    return simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    cfg = _dropped(cfg, TEN * 3, SimConfig(geom_pairs=72, contacts=240))
+    return _env(cfg, pool.settled(cfg, stream, episodes, poured=True))
 
 
 def _pool(scene: SceneState) -> SceneState:
@@ -197,71 +189,65 @@ def _pool(scene: SceneState) -> SceneState:
 
 
 def _case(cfg: Config, path: Path) -> Env:
-    case = cases.load(path, cfg.heightmap.extent)
-    if cfg.task.kind == "target":
-        cases.require_target(case)
-    library = {"objects": case.objects, "split": "all"} if case.objects else {}
-    placed: Any = {
-        "slots": case.slots,
-        "min_blocks": len(case.slots),
-        "packed_fraction": 0.0,
-        **library,
-    }
-    scene = dataclasses.replace(cfg.scene, **placed)
-    cfg = _wide(cfg, scene)
-    return Env(cfg, _physics(cfg), _pool(case.scene))
+    try:
+        case = cases.load(path, cfg.heightmap.extent)
+        if cfg.task.kind == "target":
+            cases.require_target(case)
+    except ValueError as error:
+        raise SettingsError(str(error)) from None
+    placed: Any = {"slots": case.slots, "min_blocks": len(case.slots), "packed_fraction": 0.0}
+    placed |= {"objects": case.objects, "split": "all"} if case.objects else {}
+    return _env(_wide(cfg, dataclasses.replace(cfg.scene, **placed)), _pool(case.scene))
 
 
-def _cases(cfg: Config) -> dict[str, Env]:
+def _cases(cfg: Config, *_: int) -> dict[str, Env]:
     """Builds the shipped cases, with slots for the most blocks of each kind: one compilation."""
     loaded = {name: cases.load(cases.shipped(name), cfg.heightmap.extent) for name in cases.names()}
     slots: tuple[SlotKind, ...] = ()
     for kind in typing.get_args(SlotKind):
         slots += (kind,) * max(case.slots.count(kind) for case in loaded.values())
     cfg = _wide(cfg, dataclasses.replace(cfg.scene, slots=slots, min_blocks=1))
-    physics = _physics(cfg)
-    return {
-        name: Env(cfg, physics, _pool(cases.seat(case, slots))) for name, case in loaded.items()
-    }
+    seated = {name: _pool(cases.seat(case, slots)) for name, case in loaded.items()}
+    first = _env(cfg, next(iter(seated.values())))
+    return {name: dataclasses.replace(first, scenes=scenes) for name, scenes in seated.items()}
+
+
+def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
+    cfg = cfg.change(task=TARGET)
+    ten = _ten(cfg, episodes, stream)  # which allows more actions
+    return {**_cases(cfg), "random10": dataclasses.replace(ten, cfg=ten.cfg.change(task=TARGET))}
 
 
 def _packed(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _wide(cfg, SceneConfig(slots=PACKED, min_blocks=arrange.MIN_ARRANGED))
-    scenes = arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes)
-    return Env(cfg, _physics(cfg), scenes)
+    return _env(cfg, arrange.arrangements(cfg.scene, cfg.heightmap.extent, stream, episodes))
 
 
 def _objects(cfg: Config, count: int, extent: float) -> Config:
     """Puts `count` objects in play, placed in a square of side `extent` m."""
-    placed: Any = {
-        "slots": ("object",) * count,
-        "min_blocks": count,
-        "drop_extent": (extent, extent),
-    }
-    wide = _wide(cfg, dataclasses.replace(cfg.scene, **placed))
-    return wide.change(task={"max_actions": ACTIONS_EACH * count})
+    placed: Any = {"slots": ("object",) * count, "min_blocks": count}
+    scene = dataclasses.replace(cfg.scene, **placed, drop_extent=(extent, extent))
+    return _wide(cfg, scene).change(task={"max_actions": ACTIONS_EACH * count})
 
 
 def _pile(cfg: Config, episodes: int, stream: int) -> Env:
-    cfg = _objects(cfg, FEW, PILE_EXTENT)
-    scenes = pool.settled(cfg, stream, episodes, poured=True)
-    return Env(cfg, _physics(cfg), scenes, max_failures=MAX_FAILURES)
+    cfg = _objects(cfg, FEW, 0.10)  # extents as in VGN
+    return _env(cfg, pool.settled(cfg, stream, episodes, poured=True), MAX_FAILURES)
 
 
 def _objects_packed(cfg: Config, episodes: int, stream: int) -> Env:
-    cfg = _objects(cfg, FEW, PACKED_EXTENT)
-    scenes = pool.settled(cfg, stream, episodes, packed=True)
-    return Env(cfg, _physics(cfg), scenes, max_failures=MAX_FAILURES)
+    cfg = _objects(cfg, FEW, 0.30)
+    return _env(cfg, pool.settled(cfg, stream, episodes, packed=True), MAX_FAILURES)
 
 
 def _objects10(cfg: Config, episodes: int, stream: int) -> Env:
     cfg = _objects(cfg, 10, SceneConfig().drop_extent[0])
-    return Env(cfg, _physics(cfg), pool.settled(cfg, stream, episodes))
+    return _env(cfg, pool.settled(cfg, stream, episodes))
 
 
 def _target_objects(cfg: Config, episodes: int, stream: int) -> Env:
-    ten, task = _objects10(cfg, episodes, stream), {"kind": "target", "max_actions": TARGET_ACTIONS}
-    return dataclasses.replace(ten, cfg=ten.cfg.change(task=task))
+    ten = _objects10(cfg, episodes, stream)
+    return dataclasses.replace(ten, cfg=ten.cfg.change(task=TARGET))
 
 
 def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
@@ -275,8 +261,7 @@ def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
         "noise_5mm": dataclasses.replace(noisy, pose_noise=(0.005, 0.0)),
         "noise_colours": dataclasses.replace(noisy, colour=0.2, light=0.2),
     }
-    above = {"heightmap": {"view": "ortho"}, "sensor": exact}
-    ten = _ten(cfg.change(**above), episodes, stream)
+    ten = _ten(cfg.change(heightmap={"view": "ortho"}, sensor=exact), episodes, stream)
     views = {name: {"view": "oblique"} for name in sensors} | {"straight_down": {}}
     return {
         name: dataclasses.replace(ten, cfg=ten.cfg.change(heightmap=views[name], sensor=sensor))
@@ -287,7 +272,7 @@ def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
 register(IN_DISTRIBUTION, lambda cfg, count, stream: environment.make_env(cfg, stream, count))
 register("random10", _ten, 500)
 register("random30", _thirty, 100)
-register("cases", lambda cfg, episodes, stream: _cases(cfg))
+register("cases", _cases)
 register("target", _target, target=True)
 register("packed", _packed)
 register("camera", _camera)

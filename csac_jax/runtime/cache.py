@@ -1,8 +1,8 @@
 """A cache of compiled programs on disk.
 
-The folder is the user's cache directory, with a part for each kind of machine: on the CPU an entry
-is machine code for one processor, which JAX's own key does not name. Nothing here can stop a run: a
-damaged entry is compiled again, a folder that others can write is not used.
+Each kind of machine has its folder: on the CPU an entry is machine code for one processor, which
+JAX's own key does not name. Nothing here can stop a run: a damaged entry is compiled again, a
+folder that others can write is not used.
 """
 
 import collections
@@ -66,10 +66,8 @@ def _listen() -> None:
 
 
 def _on_event(event: str, **_: object) -> None:
-    """Counts JAX's events, and silences XLA's C++ log on a CPU unless the user has chosen a level.
-
-    That log has a spurious warning for each program. Failures still raise.
-    """
+    """Counts JAX's events, and silences XLA's C++ log on a CPU unless the user has chosen a level:
+    it has a spurious warning for each program. Failures still raise."""
     _events[event] += 1
     _hits[threading.get_ident()] += event == _HIT
     first = event == _ASKED and _events[event] == 1
@@ -78,14 +76,13 @@ def _on_event(event: str, **_: object) -> None:
 
 
 def _folder() -> Path | None:
-    """Returns the user's folder for this processor and number of threads."""
-    relevant = (platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1])
-    machine = hashlib.sha256(repr((*relevant, "zlib")).encode()).hexdigest()[:16]
+    cpu = platform.machine(), platform.processor(), _processor(), _guard.pool_setting()[1]
+    machine = hashlib.sha256(repr((*cpu, "zlib")).encode()).hexdigest()[:16]
     return cache_folder.private("xla", machine)
 
 
 def _processor() -> tuple[str, ...]:
-    """Returns model and abilities of the first processor, as Linux states them; else nothing."""
+    """Returns model and abilities of the first processor, as Linux states them."""
     stated = Path("/proc/cpuinfo")
     first = stated.read_text().split("\n\n")[0] if stated.exists() else ""
     return tuple(line for line in first.splitlines() if line.split("\t")[0] in _PROCESSOR)

@@ -11,10 +11,8 @@ from csac_jax.errors import SettingsError
 
 
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
-    """Joins the other processes, before JAX is used; JAX detects what is None.
-
-    Args: coordinator, address:port of the first process. Raises SettingsError if there are none.
-    """
+    """Joins the other processes, before JAX is used; JAX detects what is None. `coordinator` is
+    address:port of the first. Raises SettingsError if there are none."""
     if processes is not None and process_id is not None and not 0 <= process_id < processes:
         raise SettingsError(f"process_id: must lie in 0 .. {processes - 1}, not {process_id}")
     try:

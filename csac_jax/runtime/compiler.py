@@ -1,13 +1,12 @@
 """Tracing of training programs, and the options that XLA compiles them with.
 
 On a CPU, XLA has a second library for convolutions, about twice as fast as Eigen at those of the
-small net. It differs between versions of jaxlib, and is used only where it is seen to be right.
-LLVM's second level of optimisation compiles sooner than the third, to as fast a program. So do
-XLA's former emitters of kernels, where it still has them: its new ones build an MLIR module for
-each of more than a thousand kernels. Choices in `XLA_FLAGS` stay.
+small net. It is used only where it is seen to be right. LLVM's second level of optimisation
+compiles sooner than the third, to as fast a program. So do XLA's former emitters of kernels: the
+new ones build an MLIR module for each of a thousand kernels. Choices in `XLA_FLAGS` stay.
 
-On a GPU, XLA would write and time many kernels of its own for each matrix product of DenseNet-121.
-That takes half of the compilation, and the vendor's library is as fast (`experiments/bench`).
+On a GPU, XLA would time many kernels of its own for each matrix product of DenseNet-121. That takes
+half of the compilation, and the vendor's library is as fast (`experiments/bench`).
 """
 
 import functools
@@ -29,10 +28,7 @@ _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float
 
 
 def lower(jitted: Any, *inputs: Any) -> Any:
-    """Lowers a jitted function without Python's garbage collector, which is a quarter faster.
-
-    Tracing makes hundreds of thousands of small objects and next to no garbage.
-    """
+    """Lowers a jitted function without Python's garbage collector, which is a quarter faster."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -47,13 +43,13 @@ def options(cfg: Config) -> dict[str, Any] | None:
 
     The second library is slow at kernel gradients, which `nets.convolution` keeps from it.
     """
-    if jax.default_backend() == "cpu":
-        chosen = os.environ.get("XLA_FLAGS", "")
-        sooner = {name: SOONER[name] for name in SOONER if f"--{name}=" not in chosen}
-        known = {name: value for name, value in sooner.items() if knows(name, value)}
-        return known | (LIBRARY if isinstance(cfg.net, SmallNet) and has_library() else {})
-    vendor = jax.default_backend() == "gpu" and not isinstance(cfg.net, SmallNet)
-    return dict(VENDOR) if vendor and all(map(knows, VENDOR, VENDOR.values())) else None
+    small, backend = isinstance(cfg.net, SmallNet), jax.default_backend()
+    if backend == "cpu":
+        flags = os.environ.get("XLA_FLAGS", "")
+        sooner = {k: v for k, v in SOONER.items() if f"--{k}=" not in flags and knows(k, v)}
+        return sooner | (LIBRARY if small and has_library() else {})
+    vendor = backend == "gpu" and not small and all(map(knows, VENDOR, VENDOR.values()))
+    return dict(VENDOR) if vendor else None
 
 
 @functools.cache
@@ -84,7 +80,5 @@ def has_library() -> bool:
 
 
 def _convolve(maps: jax.Array, kernel: jax.Array) -> jax.Array:
-    """Returns the convolution of maps [B, H, W, I] with a kernel [3, 3, I, O], zeros around."""
     layout = ("NHWC", "HWIO", "NHWC")
-    sides = [(1, 1)] * 2
-    return jax.lax.conv_general_dilated(maps, kernel, (1, 1), sides, dimension_numbers=layout)
+    return jax.lax.conv_general_dilated(maps, kernel, (1, 1), "SAME", dimension_numbers=layout)

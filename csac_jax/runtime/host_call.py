@@ -23,8 +23,6 @@ _TYPES = {1: np.bool_, 4: np.int32, 6: np.uint8, 8: np.uint32, 11: np.float32}  
 
 
 class _Function(NamedTuple):
-    """A function of the host and the structure of its arguments."""
-
     call: Callable[..., Any]
     arguments: Any  # tree structure
 
@@ -48,7 +46,6 @@ def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -
 
 @functools.cache
 def _register() -> None:
-    """Registers the handler with XLA, once a process."""
     make = ctypes.pythonapi.PyCapsule_New
     make.restype, make.argtypes = ctypes.py_object, (c_void_p, c_char_p, c_void_p)
     capsule = make(ctypes.cast(_handler, c_void_p), b"xla._CUSTOM_CALL_TARGET", None)
@@ -109,7 +106,7 @@ def _handler(pointer: Any) -> int | None:
 
 
 def _tell_version(frame: Any) -> None:
-    """Reports the version of the interface that XLA has as the handler's."""
+    """Reports XLA's version of the interface as the handler's."""
     extension = ctypes.cast(frame.extension, POINTER(_Extension)).contents
     if extension.type == _METADATA:
         version = ctypes.cast(extension.value, POINTER(_Metadata)).contents.version
@@ -118,7 +115,6 @@ def _tell_version(frame: Any) -> None:
 
 
 def _run(frame: Any) -> None:
-    """Calls the function that the frame names, and writes what it returns."""
     text = frame.attributes.values[0].contents
     function = _functions[ctypes.string_at(text.start, text.length).decode()]
     result = function.call(*jax.tree.unflatten(function.arguments, _arrays(frame.arguments)))
@@ -129,7 +125,6 @@ def _run(frame: Any) -> None:
 
 
 def _arrays(buffers: Any) -> list[np.ndarray]:
-    """Returns views of buffers."""
     return [_array(buffers.values[i].contents) for i in range(buffers.size)]
 
 

@@ -1,7 +1,4 @@
-"""Work for several processes of this program, each on a core of its own.
-
-With few scenes, one process hardly gains by a second core.
-"""
+"""Work for several processes of this program, each on its core: one hardly gains by a second."""
 
 import contextlib
 import multiprocessing
@@ -37,12 +34,12 @@ def each(
     on_progress: Callable[..., None],
     on_done: Callable[[int, Any], None],
 ) -> None:
-    """Calls `work(report, *task)` for every task, `jobs` at a time.
+    """Calls `work(report, *task)`, a function of a module, for every task, `jobs` at a time.
 
     One at a time runs in this process. More run in processes of their own, whose JAX computes on
-    the CPU. All end with the first error, and with this process. Args: work, a function of a
-    module; on_progress, gets what work gives to `report`; on_done, gets the number of a task and
-    its result. Raises FailedError if a process was ended from outside, as for lack of memory.
+    the CPU. All end with the first error, and with this process. Args: on_progress, gets what work
+    reports; on_done, gets the number of a task and its result. Raises FailedError if a process was
+    ended from outside, as for lack of memory.
     """
     if min(jobs, len(tasks)) <= 1:
         for number, task in enumerate(tasks):
@@ -61,7 +58,6 @@ def each(
 
 @contextlib.contextmanager
 def _pool(jobs: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
-    """Starts processes; yields them and the queue of their reports."""
     context = multiprocessing.get_context("spawn")
     free, reports = context.SimpleQueue(), context.SimpleQueue()
     allowed = sorted(os.sched_getaffinity(0))
@@ -84,7 +80,6 @@ _reports: Any = None  # the queue, in a process of a pool
 
 
 def _begin(free: Any, reports: Any) -> None:
-    """Begins a process of a pool."""
     global _reports
     _reports = reports
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; one ends the others
@@ -96,7 +91,6 @@ def _begin(free: Any, reports: Any) -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when its parent ends, however that was."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
@@ -104,5 +98,4 @@ def _end_with_parent() -> None:
 
 
 def _run(work: Callable[..., Any], task: tuple) -> Any:
-    """Runs one task in a process of a pool."""
     return work(lambda *report: _reports.put(report), *task)

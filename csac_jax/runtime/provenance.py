@@ -44,9 +44,7 @@ def device() -> str:
 
 def commit() -> str | None:
     """Returns the commit of the package's checkout, with "-dirty" if files differ; else None.
-
-    CSAC_JAX_COMMIT replaces it: in a container the sources come without their history.
-    """
+    CSAC_JAX_COMMIT replaces it, for containers that have no history."""
     if named := os.environ.get("CSAC_JAX_COMMIT"):
         return named
     folder = Path(__file__).resolve().parent
@@ -58,7 +56,6 @@ def commit() -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Returns git's output; None if it is empty or git fails."""
     command = ["git", "-C", str(folder), *arguments]
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=10)

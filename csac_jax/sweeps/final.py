@@ -8,15 +8,13 @@ evaluation continues where it was.
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any
 
 from csac_jax.config import Config, PhysicsKind
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
-from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.sweeps.runner import SweepPlan, SweepRun, runs_of
+from csac_jax.sweeps.runner import SweepPlan, runs_of
 from csac_jax.training.loop import Reporter
 
 OWN = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
@@ -31,46 +29,39 @@ def measure(
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
     ValueError as `suites.prepare` does, before anything is measured there.
     """
+    name = "eval.json" if suite == OWN else f"eval-{Path(suite).stem}.json"
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
-        left = [run for run in runs if _is_left(folder / run.folder, suite)]
-        if done := sum((folder / run.folder / _result(suite)).exists() for run in runs):
-            reporter.log(f"{point.name}: {done} policies have their {_result(suite)} already")
+        paths = {folder / run.folder / name: run.cfg for run in runs}
+        if done := sum(path.exists() for path in paths):
+            reporter.log(f"{point.name}: {done} policies have their {name} already")
+        left = {path: cfg for path, cfg in paths.items() if _is_left(path)}
         if left and stop.signal is None:
             reporter.log(f"evaluating {point.name}: {len(left)} policies")
-            _measure_point(plan.episodes, suite, point, folder, left, stop)
+            _measure_point(plan.episodes, suite, point.cfg, left, stop)
     return stop.signal
 
 
-def _result(suite: str) -> str:
-    return "eval.json" if suite == OWN else f"eval-{Path(suite).stem}.json"
-
-
-def _is_left(path: Path, suite: str) -> bool:
-    return checkpoint.latest_step(path) is not None and not (path / _result(suite)).exists()
+def _is_left(path: Path) -> bool:
+    return not path.exists() and checkpoint.latest_step(path.parent) is not None
 
 
 def _measure_point(
-    episodes: int, suite: str, point: SweepPoint, folder: Path, runs: list[SweepRun], stop: Stop
+    episodes: int, suite: str, cfg: Config, left: dict[Path, Config], stop: Stop
 ) -> None:
     """Evaluates runs of one point, which share scenes and compiled episodes.
 
-    In C MuJoCo if they were trained in it, on whatever device.
+    In C MuJoCo if they were trained in it, on whatever device. Args: left, files to write.
     """
-    physics: PhysicsKind = "c" if point.cfg.sim.physics == "c" else "auto"
-    robot = point.cfg.sim.robot
-    prepared = suites.prepare(point.cfg, suite, episodes, SEED, physics, robot)
-    for run in runs:
+    physics: PhysicsKind = "c" if cfg.sim.physics == "c" else "auto"
+    prepared = suites.prepare(cfg, suite, episodes, SEED, physics, cfg.sim.robot)
+    for path, trained in left.items():
         if stop.signal is not None:
             return
-        begun, path = time.time(), folder / run.folder
-        found = rollout.evaluate(policies.load(path), prepared)
-        measured = dataclasses.replace(prepared.cfg, seed=run.cfg.seed)
-        _write(path / _result(suite), suite, measured, found, begun)
-
-
-def _write(path: Path, suite: str, cfg: Config, table: dict[str, Any], begun: float) -> None:
-    asked = {"policy": "learned", "suite": suite, "seed": SEED}
-    seconds = {"seconds": round(time.time() - begun, 1)}
-    config = {"config": configs.to_dict(cfg)}
-    files.write_json(path, {**asked, **seconds, **table, **config, **provenance.record()})
+        begun = time.time()
+        table = rollout.evaluate(policies.load(path.parent), prepared)
+        asked = {"policy": "learned", "suite": suite, "seed": SEED}
+        seconds = {"seconds": round(time.time() - begun, 1)}
+        measured = dataclasses.replace(prepared.cfg, seed=trained.seed)
+        config = {"config": configs.to_dict(measured)}
+        files.write_json(path, asked | seconds | table | config | provenance.record())

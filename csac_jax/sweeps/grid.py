@@ -30,20 +30,17 @@ _NOISE = {
     "sensor.pose_noise": (0.001, 0.002),
     "sensor.colour": 0.05,
 }
-_SENSED, _ANYWHERE = {"reward.outcome_source": "sensors"}, {"policy.action_mask": "none"}
-_UR5 = {"sim.robot": "ur5"}
 SWITCHES: dict[str, dict[str, Any]] = {
     "none": {},
-    "sensed": _SENSED,
-    "anywhere": _ANYWHERE,
+    "sensed": {"reward.outcome_source": "sensors"},
+    "anywhere": {"policy.action_mask": "none"},
     "oblique": _OBLIQUE,
     "noisy": _OBLIQUE | _NOISE,
-    "ur5": _UR5,
-    "together": _SENSED | _ANYWHERE | _OBLIQUE | _NOISE | _UR5,
+    "ur5": {"sim.robot": "ur5"},
 }
+SWITCHES["together"] = {name: value for item in SWITCHES.values() for name, value in item.items()}
 """Values of the varied name `switch`: settings nearer to a robot; camera errors are ours."""
-BUNDLES = {"task": TASKS, "switch": SWITCHES}
-"""Varied names that stand for several settings."""
+BUNDLES = {"task": TASKS, "switch": SWITCHES}  # varied names that stand for several settings
 _VALUE = re.compile(r"([^./-]|-?\.?\d|-inf)[^/]*")  # a negative number is no flag
 
 
@@ -64,11 +61,8 @@ def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> l
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
         raise SettingsError("vary: a setting is given twice; name it once, with all its values")
-
-    def from_flags(values: dict[str, str]) -> Config:
-        return configure([flag for name in values for flag in _flags(name, values[name])])
-
-    return combine(axes, from_flags)
+    flags = lambda values: [flag for item in values.items() for flag in _flags(*item)]  # noqa: E731
+    return combine(axes, lambda values: configure(flags(values)))
 
 
 def combine(
@@ -151,5 +145,4 @@ def _flags(name: str, value: str) -> list[str]:
 
 
 def _text(value: Any) -> str:
-    """Formats a value as `points` reads it."""
     return ":".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -18,6 +18,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from csac_jax.agent import rewards
 from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config, SmallNet
+from csac_jax.io import configs
 from csac_jax.nets import chunked_vmap
 from csac_jax.nets.chunked_vmap import Batching
 from csac_jax.runtime import compiler
@@ -30,13 +31,11 @@ from csac_jax.training.transitions import StepMetrics
 _TRACED = {
     "target": "gamma",
     "reward": "success_bonus grasp_levels push_levels lost_block_penalty",
-    "explore": "noise_std epsilon_primitive epsilon_place decay push_fraction",
+    "explore": "noise_std epsilon_primitive epsilon_place epsilon_decay push_fraction",
     "learn": "learning_rate actor_learning_rate lr_final_fraction tau",
     "replay": "start middle end",
 }
-TRACED_HYPERPARAMS = tuple(
-    f"{section}.{name}" for section, names in _TRACED.items() for name in names.split()
-)
+TRACED_HYPERPARAMS = tuple(f"{key}.{name}" for key in _TRACED for name in _TRACED[key].split())
 """Settings that enter a program as numbers only: no shape and no branch depends on them."""
 
 
@@ -64,41 +63,36 @@ class ProgramGroup(NamedTuple):
     hyperparams: tuple[str, ...]  # those in which they differ
 
 
-def group_configs(configs: Sequence[Config]) -> list[ProgramGroup]:
+def group_configs(cfgs: Sequence[Config]) -> list[ProgramGroup]:
     """Groups configs, in as few groups as possible, in the order of their first ones."""
     groups: dict[Config, list[Config]] = {}
-    for cfg in configs:
+    for cfg in cfgs:
         unnamed = dataclasses.replace(cfg, seed=0, preset="", algo="csac")
         blank = programs.replace_settings(unnamed, dict.fromkeys(_traced(cfg)))
         groups.setdefault(blank, []).append(cfg)
     return [ProgramGroup(tuple(alike), _differing(alike)) for alike in groups.values()]
 
 
-def _differing(configs: Sequence[Config]) -> tuple[str, ...]:
-    """Returns the names of the TRACED_HYPERPARAMS in which configs differ."""
-    first, *others = map(_traced, configs)
+def _differing(cfgs: Sequence[Config]) -> tuple[str, ...]:
+    first, *others = map(_traced, cfgs)
     return tuple(name for name in first if any(other[name] != first[name] for other in others))
 
 
 def _traced(cfg: Config) -> dict[str, Any]:
     """Returns the TRACED_HYPERPARAMS that this config has: alternatives have their own."""
-    settings = {
-        f"{section}.{name}": value
-        for section in _TRACED
-        for name, value in vars(getattr(cfg, section)).items()
-    }
+    settings = configs.flat(configs.to_dict(cfg))
     return {name: settings[name] for name in TRACED_HYPERPARAMS if name in settings}
 
 
 def group_replicas(group: ProgramGroup) -> Replicas:
     """Returns seeds and settings of a group, as NumPy arrays: every process has a copy."""
-    configs, names = group
-    seed = np.array([cfg.seed for cfg in configs], np.uint32)
+    cfgs, names = group
+    seed = np.array([cfg.seed for cfg in cfgs], np.uint32)
     if not names:
         return Replicas(seed, None)
-    traced = [_traced(cfg) for cfg in configs]
+    traced = [_traced(cfg) for cfg in cfgs]
     values = {name: np.array([row[name] for row in traced], np.float32) for name in names}
-    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in configs]
+    bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in cfgs]
     low, high = np.array(bounds, np.float32).T
     return Replicas(seed, Hyperparams(values, (low, high)))
 
@@ -119,8 +113,7 @@ class SweepProgram:
         state = self._jitted_init()(self.replicas)
         if self.start is None:
             return state
-        started = state.replace(learner=self.start(state.learner))
-        return jax.device_put(started, self._shardings())
+        return jax.device_put(state.replace(learner=self.start(state.learner)), self._shardings())
 
     def abstract(self) -> TrainState:
         """Returns shapes, dtypes and shardings of `init`'s state; nothing is compiled."""
@@ -129,8 +122,7 @@ class SweepProgram:
     def compile_chunk(self, num_steps: int) -> Any:
         """Returns a jitted state -> (state, StepMetrics [T, S, ...]) of T = `num_steps` steps.
 
-        The state is donated. With a mesh over seeds each device scans its own replicas; metrics end
-        up on every device.
+        The state is donated. With a mesh over seeds each device scans its own replicas.
         """
         mesh, replicas, program = self.mesh, self.replicas, self.program
         vmapped = len(replicas.seed) // (self.parts if mesh is None else mesh.size)
@@ -164,11 +156,8 @@ class SweepProgram:
         return jit(lambda state: chunk(state, replicas), out_shardings=places)
 
     def _batching(self, vmapped: int) -> Batching:
-        """Returns how the networks of so many runs work under `vmap`.
-
-        Not in chunks where hyper-parameters are traced, as `vmap_in_chunks` cannot close over them,
-        or where scenes are sharded.
-        """
+        """Returns how the networks of so many runs work under `vmap`; in no chunks where scenes are
+        sharded or hyper-parameters traced: `vmap_in_chunks` cannot close over them."""
         sharded = self.mesh is not None and self.shard == "scenes"
         chunked = not sharded and self.replicas.hyperparams is None
         at_once = chunked_vmap.chunk_size(self.program.cfg, vmapped) if chunked else None
@@ -182,14 +171,12 @@ class SweepProgram:
 
     def _jitted_init(self) -> Any:
         def init_one(replica: Replicas) -> TrainState:
-            return programs.init_state(
-                self.program, jax.random.key(replica.seed), replica.hyperparams
-            )
+            key = jax.random.key(replica.seed)
+            return programs.init_state(self.program, key, replica.hyperparams)
 
         return jax.jit(jax.vmap(init_one, out_axes=AXES), out_shardings=self._shardings())
 
     def _shardings(self) -> Any:
-        """Returns the shardings of a state, as a prefix of it; None without a mesh."""
         if self.mesh is None:
             return None
         return jax.tree.map(functools.partial(NamedSharding, self.mesh), _SPECS[self.shard])
@@ -205,10 +192,10 @@ def sweep_program(
 
 
 def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
-    """Returns how many parts are best for so many replicas, see `Pipelined`.
+    """Returns how many parts are best for so many replicas, see `Pipelined`; on a GPU at most two.
 
-    On a GPU at most two, ours. One on several devices, for DenseNet-121, which keeps a device busy,
-    and where the states do not fit twice: they are taken apart and joined again.
+    One on several devices, for DenseNet-121, which keeps a device busy, and where the states do not
+    fit twice: they are taken apart and joined again.
     """
     even = cfg.sim.physics == "c" and replicas % 2 == 0
     parts = replicas if jax.default_backend() == "cpu" else 2 if even else 1
@@ -221,12 +208,11 @@ def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pipelined:
     """A chunk of all replicas made of one that serves an equal part of them; the state is donated.
-
     It is lowered and compiled like a jitted function, and callable once compiled.
 
-    On a GPU with C physics the device waits for the host. The host moves the scenes of one part
-    while the device is at work for another. On a CPU each replica is a part, one after the other:
-    vmapped convolutions become grouped ones, which take twice as long.
+    On a GPU with C physics the host moves the scenes of one part while the device is at work for
+    another. On a CPU each replica is a part, one after the other: vmapped convolutions become
+    grouped ones, which take twice as long.
     """
 
     program: Any  # jitted, lowered or compiled: (state of a part, its replicas) -> (state, metrics)
@@ -258,29 +244,27 @@ class Pipelined:
 
 
 def _in_parts(tree: Any, parts: int) -> list[Any]:
-    """Splits leaves [S, ...] into equal parts."""
     split = jax.tree.map(lambda leaf: leaf.reshape(parts, -1, *leaf.shape[1:]), tree)
     return [jax.tree.map(lambda leaf, k=k: leaf[k], split) for k in range(parts)]
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _split(state: TrainState, parts: int) -> list[TrainState]:
-    """Copies the states of equal parts."""
     split = _in_parts(state.replace(step=()), parts)
     return [jax.tree.map(jnp.copy, part.replace(step=state.step)) for part in split]
 
 
 @jax.jit
 def _join(done: Sequence[tuple[TrainState, StepMetrics]]) -> tuple[TrainState, StepMetrics]:
-    """Joins states [S', ...] and metrics [T, S', ...] of parts to those of all replicas."""
+    """Joins states [S', ...] and metrics [T, S', ...] of parts."""
     states, metrics = zip(*done, strict=True)
     leading = [state.replace(step=()) for state in states]
     joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *leading)
-    all_metrics = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *metrics)
-    return joined.replace(step=states[0].step), all_metrics
+    beside = jax.tree.map(lambda *leaves: jnp.concatenate(leaves, axis=1), *metrics)
+    return joined.replace(step=states[0].step), beside
 
 
 def replica(state: TrainState, index: int) -> TrainState:
     """Returns the state of one replica, as `train` has it."""
-    own = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
-    return own.replace(step=state.step)
+    part = jax.tree.map(lambda leaf: leaf[index], state.replace(step=()))
+    return part.replace(step=state.step)

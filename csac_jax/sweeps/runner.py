@@ -37,9 +37,8 @@ from csac_jax.training import loop, memory
 from csac_jax.training.callbacks import Record
 
 SUMMARY = "summary.json"
-DONE = "done"
-RESERVED = ("groups", files.SWEEP_PLAN, SUMMARY, "train.json")  # in the sweep's folder
 DIGEST = "sha256"  # key of the plan's own digest
+RESERVED = ("groups", files.SWEEP_PLAN, SUMMARY, "train.json")  # in the sweep's folder
 _NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
 MOST_EPISODES = 100_000  # of an evaluation, ours: more is a slip of the pen
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
@@ -99,7 +98,7 @@ def run(
     with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
         for index, (group, _) in enumerate(sweep.groups):
             group_folder = folder / "groups" / str(index)
-            if not sweep.stopping() and not (group_folder / DONE).exists():
+            if not sweep.stopping() and not (group_folder / "done").exists():
                 sweep.train_group(index, group_folder, make_program(group))
         summary = summarise(plan, folder)
         if cluster.is_first():
@@ -112,33 +111,31 @@ def run(
 
 def read_plan(folder: Path) -> SweepPlan:
     """Reads the plan of a sweep's folder. Raises SweepError if it cannot be read."""
+    path = folder / files.SWEEP_PLAN
     try:
-        stored = files.read_object(folder / files.SWEEP_PLAN)
-        if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
-            raise ValueError("it was changed after it had been written")
-        if stored.keys() - {"episodes"} != {"seeds", "settings"}:
-            raise ValueError("it is no plan of a sweep")
-        points = [
-            SweepPoint(
-                point["name"],
-                dict(renames.current_setting(*pair) for pair in point["values"].items()),
-                configs.from_dict(point["config"]),
-            )
-            for point in stored["settings"]
-        ]
-        plan = SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
+        plan = _parse_plan(files.read_object(path))
         check_plan(plan)
         _check_unchanged(plan, folder)
-        return plan
     except FileNotFoundError:
         raise SweepError(
-            f"there is no {files.SWEEP_PLAN} in {folder}; give the folder of a sweep"
+            f"there is no {path.name} in {folder}; give the folder of a sweep"
         ) from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         reason = files.first_line(error)
-        raise SweepError(
-            f"{folder / files.SWEEP_PLAN} cannot be read ({reason}); begin a new sweep"
-        ) from None
+        raise SweepError(f"{path} cannot be read ({reason}); begin a new sweep") from None
+    return plan
+
+
+def _parse_plan(stored: dict[str, Any]) -> SweepPlan:
+    if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
+        raise ValueError("it was changed after it had been written")
+    if stored.keys() - {"episodes"} != {"seeds", "settings"}:
+        raise ValueError("it is no plan of a sweep")
+    points = []
+    for point in stored["settings"]:
+        values = dict(renames.current_setting(*pair) for pair in point["values"].items())
+        points.append(SweepPoint(point["name"], values, configs.from_dict(point["config"])))
+    return SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
 
 
 def plan_text(plan: SweepPlan) -> str:
@@ -161,8 +158,7 @@ def check_plan(plan: SweepPlan) -> None:
         raise SettingsError(f"seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
     if type(plan.episodes) is not int or not 0 <= plan.episodes <= MOST_EPISODES:
         raise SettingsError(f"episodes: 0 to {MOST_EPISODES}")
-    names = [point.name for point in plan.points]
-    for name in names:
+    for name in (names := [point.name for point in plan.points]):
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
             raise SettingsError(f"{shown(name)} is no name of a folder")
         if name in RESERVED:
@@ -176,10 +172,9 @@ def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
     for run in runs_of(plan):
         if not (folder / run.folder).resolve().is_relative_to(folder.resolve()):
             raise ValueError(f"{run.folder} is a link out of the sweep's folder")
-        path = folder / run.folder / files.CONFIG
-        if path.exists():
-            names = configs.differences(configs.from_dict(files.read_object(path)), run.cfg)
-            if names:
+        if (path := folder / run.folder / files.CONFIG).exists():
+            stored = configs.from_dict(files.read_object(path))
+            if names := configs.differences(stored, run.cfg):
                 raise ValueError(f"{run.folder} has other values of {', '.join(names)}")
 
 
@@ -248,20 +243,20 @@ class _Sweep:
             values = [getattr(record, name) for record in records]
             return loop.mean([value for value in values if value is not None])
 
-        cfgs = [[run.cfg for run in runs] for _, runs in self.groups]
-        actions = [sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in group) for group in cfgs]
-        done = sum(actions[:index]) + records[0].actions * len(cfgs[index])
+        actions = [
+            sum(loop.total_steps(run.cfg) * run.cfg.train.scenes for run in runs)
+            for _, runs in self.groups
+        ]
+        done = sum(actions[:index]) + records[0].actions * len(self.groups[index][1])
         total, speed = sum(actions), sum(record.actions_per_second for record in records)
-        shown = dataclasses.replace(
-            records[0],
-            actions=done,
-            actions_per_second=speed,
-            grasp_success=mean("grasp_success"),
-            grasps_counted=sum(record.grasps_counted for record in records),
-            critic_loss=mean("critic_loss"),
-            actor_loss=mean("actor_loss"),
-        )
-        self.reporter.progress(shown, total, (total - done) / max(speed, 1e-9))
+        shown: Any = {
+            **{name: mean(name) for name in ("grasp_success", "critic_loss", "actor_loss")},
+            "actions": done,
+            "actions_per_second": speed,
+            "grasps_counted": sum(record.grasps_counted for record in records),
+        }
+        record = dataclasses.replace(records[0], **shown)
+        self.reporter.progress(record, total, (total - done) / max(speed, 1e-9))
 
 
 class _GroupTraining:
@@ -292,7 +287,6 @@ class _GroupTraining:
                 files.truncate_log(path / files.METRICS, self.step)
 
     def title(self) -> str:
-        """Describes its runs, and the step that it continues from."""
         names = list(dict.fromkeys(run.point for run in self.runs))
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         since = f", resumed at step {self.step}" if self.step else ""
@@ -325,7 +319,6 @@ class _GroupTraining:
         return records
 
     def save(self) -> None:
-        """Writes a checkpoint of the group."""
         runs = list(zip(self.loop_states, self.failed, strict=True))
         checkpoint.save(self.folder, self.step, self.state, self.cfg, {"runs": runs})
         self.saved = self.step
@@ -337,7 +330,7 @@ class _GroupTraining:
                 state, extra = self.program.replica(self.state, i), self.loop_states[i]._asdict()
                 checkpoint.save(path, self.step, state, self.runs[i].cfg, extra)
         if cluster.is_first():
-            files.replace(self.folder / DONE, "")
+            files.replace(self.folder / "done", "")
             shutil.rmtree(self.folder / checkpoint.FOLDER, ignore_errors=True)
         cluster.wait(f"finished {self.folder}")
 

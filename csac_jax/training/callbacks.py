@@ -80,32 +80,32 @@ def joined(callbacks: Sequence[Callback | Callable[[Record], None]]) -> Callback
     )
 
 
+@dataclasses.dataclass
 class _FunctionCallback(Callback):
-    def __init__(self, call: Callable[[Record], None]) -> None:
-        self._call = call
+    call: Callable[[Record], None]
 
     def chunk(self, record: Record, state: Any) -> None:
-        self._call(record)
+        self.call(record)
 
 
+@dataclasses.dataclass
 class _Joined(Callback):
-    def __init__(self, callbacks: Sequence[Callback]) -> None:
-        self._callbacks = callbacks
+    callbacks: Sequence[Callback]
 
     def begin(self, run: RunInfo) -> None:
-        for callback in self._callbacks:
+        for callback in self.callbacks:
             callback.begin(run)
 
     def chunk(self, record: Record, state: Any) -> None:
-        for callback in self._callbacks:
+        for callback in self.callbacks:
             callback.chunk(record, state)
 
     def evaluated(self, record: Record, table: dict[str, Any]) -> None:
-        for callback in self._callbacks:
+        for callback in self.callbacks:
             callback.evaluated(record, table)
 
     def end(self, summary: Summary | None) -> None:
-        for callback in self._callbacks:
+        for callback in self.callbacks:
             callback.end(summary)
 
 

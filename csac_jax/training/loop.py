@@ -21,13 +21,12 @@ from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
 from csac_jax.training.callbacks import SILENT, Callback, Record, RunInfo, Summary
+from csac_jax.training.transitions import LOSSES
 
-LOSSES = ("critic_loss", "actor_loss")
 SUMS = (
-    "cleared blocks_lost terminated truncated gap_disagrees contact_overflow physics_diverged "
-    "unreachable"
+    *("cleared", "blocks_lost", "terminated", "truncated"),
+    *("gap_disagrees", "contact_overflow", "physics_diverged", "unreachable"),
 )
-MEANS = "critic_loss actor_loss td_error q_mean"
 DIVERGED_SHARE = 1e-3  # of a chunk's actions: more diverged physics is logged; 1e-5 is common
 
 
@@ -82,10 +81,8 @@ def run(
 
     Args: run_dir, exists if `resume`, else is made; init, creates the initial state in a thread of
     its own, a pytree with `step` [] int32 that is 0; compile_chunk, takes the number of steps and
-    gives a jitted function state -> (state, StepMetrics [T, ...]) that may use up its argument; at,
-    the step to resume from, by default the newest sound one. Raises TrainingError on a loss or
-    parameter that is not finite, CheckpointError if there is nothing sound to resume from or the
-    disc is full, LockedError if another process trains in `run_dir`.
+    gives a jitted function state -> (state, StepMetrics [T, ...]) that may use up its argument.
+    For the rest and the errors see `api.train`.
     """
     checkpoint.check_path(run_dir)
     if not resume:
@@ -96,13 +93,12 @@ def run(
             actions = start.step * cfg.train.scenes
             reporter.log(f"resumed {run_dir} at step {start.step} ({actions} actions)")
         callback.begin(RunInfo(cfg, run_dir, start.step))
+        summary = None
         try:
             summary = _train(cfg, run_dir, start, compile_chunk, reporter, stop, callback)
-        except Exception:
-            callback.end(None)
-            raise
-        callback.end(summary)
-        return summary
+            return summary
+        finally:
+            callback.end(summary)
 
 
 def _train(
@@ -114,7 +110,6 @@ def _train(
     stop: Stop,
     callback: Callback,
 ) -> Summary:
-    """Trains from `start` on, see `run`; nobody else writes in the folder."""
     step, loop_state, saved = start.step, start.loop_state, start.saved
     total, scenes = total_steps(cfg), cfg.train.scenes
     chunk, compile_seconds, warned = None, 0.0, False
@@ -137,11 +132,12 @@ def _train(
             warned = True
             reporter.log(warning)
         if step % (cfg.train.save_every * cfg.train.chunk) == 0:
-            saved = _save(cfg, run_dir, step, state, loop_state)
+            checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())
+            saved = step
         callback.chunk(record, state)
     if saved != step:
         state = start.state.result() if chunk is None else state
-        _save(cfg, run_dir, step, state, loop_state)
+        checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())
     stopped = f"stopped and saved at step {step}; continue with: csac-jax train --resume {run_dir}"
     done = f"done: {step * scenes} actions; saved in {run_dir}"
     reporter.log(done if stop.signal is None else stopped)
@@ -173,11 +169,6 @@ def _begin(
     files.truncate_log(run_dir / files.METRICS, step)
     loop_state = LoopState(extra["seconds"], extra["grasps"])
     return _Start(step, loop_state, step, shapes, thread.submit(lambda: state))
-
-
-def _save(cfg: Config, run_dir: Path, step: int, state: Any, loop_state: LoopState) -> int:
-    checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())
-    return step
 
 
 def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
@@ -216,7 +207,7 @@ def timed(chunk: Callable[[Any], Any], state: Any) -> tuple[Any, Any, float]:
 
 def not_finite(metrics: Any) -> str | None:
     """Returns the name of the first non-finite loss, or None; those of the warm-up do not count."""
-    for name in LOSSES:
+    for name in ("critic_loss", "actor_loss"):
         if not np.isfinite(getattr(metrics, name)[metrics.learned]).all():
             return name
     return None if metrics.finite.all() else "a parameter"
@@ -225,10 +216,8 @@ def not_finite(metrics: Any) -> str | None:
 def _not_finite_text(run_dir: Path, name: str, step: int) -> str:
     last = checkpoint.latest_step(run_dir)
     kept = "no checkpoint was saved" if last is None else f"the checkpoint of step {last} is kept"
-    return (
-        f"{name} is not finite in the chunk that ended at step {step}; {kept}; "
-        "lower learn.learning_rate and train again"
-    )
+    where = f"{name} is not finite in the chunk that ended at step {step}"
+    return f"{where}; {kept}; lower learn.learning_rate and train again"
 
 
 def _physics_warning(cfg: Config, record: Record) -> str | None:
@@ -251,8 +240,8 @@ def record_chunk(
     window = collections.deque(before.grasps, maxlen=GRASP_WINDOW)
     window.extend((outcomes == Outcome.LIFTED).astype(int).tolist())
     counts = np.bincount(outcomes, minlength=len(OUTCOMES)).tolist()
-    sums: Any = {name: int(getattr(metrics, name).sum()) for name in SUMS.split()}
-    means: Any = {name: mean(getattr(metrics, name)[metrics.learned]) for name in MEANS.split()}
+    sums: Any = {name: int(getattr(metrics, name).sum()) for name in SUMS}
+    means: Any = {name: mean(getattr(metrics, name)[metrics.learned]) for name in LOSSES}
     record = Record(
         step=step,
         actions=step * cfg.train.scenes,

@@ -15,10 +15,7 @@ GIB = 2**30
 
 
 def limit() -> int:
-    """Returns the bytes of the first device; this machine's memory if it states none (CPUs).
-
-    All, not what is free: the system gives up its caches for a run.
-    """
+    """Returns all bytes of the first device; this machine's memory if it states none (CPUs)."""
     stats = jax.devices()[0].memory_stats() or {}
     return stats.get("bytes_limit") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 

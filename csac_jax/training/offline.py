@@ -56,7 +56,6 @@ def fill(program: Program, transitions: Transition) -> ReplayState:
 @functools.lru_cache(maxsize=2)
 def compile_step(program: Program):
     """Returns a jitted function state -> (state, losses), of one step; the state is donated."""
-
     cfg = program.cfg
 
     def one(state: OfflineState) -> tuple[OfflineState, dict[str, jax.Array]]:

@@ -12,7 +12,6 @@ PLAIN_INTERVAL = 10.0  # s between lines where there is no terminal
 
 
 def _describe(record: Record, eta: float | None) -> str:
-    """Describes a chunk in one line; `eta` is the remaining time, s, if known."""
     parts = [f"{record.actions_per_second:.1f}/s"]
     if record.grasp_success is not None:
         parts.append(f"grasp success {record.grasp_success:.0%} of last {record.grasps_counted}")

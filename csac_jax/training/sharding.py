@@ -34,11 +34,8 @@ def shard_batch(mesh: Mesh | None, tree: Any) -> Any:
 
 
 def make(devices: int | None) -> Mesh | None:
-    """Makes a mesh of the first `devices` devices; None for a single one.
-
-    By default one device, or all of several processes, which use no fewer. Raises SettingsError if
-    there are not so many.
-    """
+    """Makes a mesh of the first `devices` devices; None for a single one. By default one device, or
+    all of several processes. Raises SettingsError if there are not so many."""
     present, alone = jax.devices(), jax.process_count() == 1
     wanted = (1 if alone else len(present)) if devices is None else devices
     if not alone and wanted != len(present):

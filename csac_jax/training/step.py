@@ -168,11 +168,10 @@ def numbered_keys(key: jax.Array, num: int) -> jax.Array:
 
 
 def _step_keys(key: jax.Array, step: jax.Array) -> tuple[jax.Array, ...]:
-    """Returns the keys of a step: to act, to learn and to reset."""
+    """Returns the keys to act, to learn and to reset."""
     return tuple(jax.random.split(jax.random.fold_in(key, step), 3))
 
 
 def _is_finite(tree: Any) -> jax.Array:
-    """Returns True where every float of a pytree is finite, [] bool."""
     floats = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in floats], bool))

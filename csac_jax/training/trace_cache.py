@@ -1,9 +1,8 @@
 """Traced training programs on disk, so that a later run of the same program begins without a trace.
 
 With a warm cache of compiled programs, tracing is more than half of a start. JAX exports what it
-traced as StableHLO, in a folder with the compiled programs. A file's name is a digest of all that
-decides the trace: settings but for the seed, sources of the package, versions, JAX's own settings,
-world and scenes. Only programs of one CPU are cached, in C's or MJX's physics.
+traced as StableHLO. A file's name is a digest of all that decides the trace, see `name`. Only
+programs of one CPU are cached, in C's or MJX's physics.
 """
 
 import contextlib
@@ -11,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import os
+import re
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -26,20 +26,19 @@ from csac_jax.training.transitions import StepMetrics
 from csac_jax.world import object_slots
 
 MOST = 64  # files, of some MB each; those unused for longest are deleted
-_UNTRACED = ("cache", "logging")  # parts of names of JAX's settings that leave a trace as it is
+_UNTRACED = re.compile("cache|logging")  # in names of JAX's settings that change no trace
 
 
 def jit(program: Program, half: Callable[..., Any], cached: bool) -> Any:
     """Returns a jitted half of `step.train_step`, or what has `lower` alone if it can be `cached`.
 
-    The state is donated. A cached program has no parts of a user's own.
+    The state is donated. A cached program has no custom parts.
     """
-    options = compiler.options(program.cfg)
     bound = functools.partial(half, program)
-    folder = _folder() if cached and _is_named(program) else None
-    if folder is not None:
+    one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
+    if cached and one_cpu and program.cfg.sim.physics in ("c", "mjx") and (folder := _folder()):
         return _Cached(program, half.__name__, bound, folder)
-    return jax.jit(bound, donate_argnums=0, compiler_options=options)
+    return jax.jit(bound, donate_argnums=0, compiler_options=compiler.options(program.cfg))
 
 
 def _folder() -> Path | None:
@@ -47,12 +46,6 @@ def _folder() -> Path | None:
     chosen = jax.config.jax_compilation_cache_dir
     on = jax.config.jax_enable_compilation_cache and chosen and "://" not in chosen
     return Path(chosen) / "traced" if on else None
-
-
-def _is_named(program: Program) -> bool:
-    """Returns True if `name` holds all that the program is made of."""
-    one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
-    return one_cpu and program.cfg.sim.physics in ("c", "mjx")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,7 +58,6 @@ class _Cached:
     folder: Path
 
     def lower(self, *inputs: Any) -> Any:
-        """Lowers the half for a state, and maybe metrics, such as these."""
         leaves, tree = jax.tree.flatten(inputs)
         path = self.folder / name(self.program, self.half, leaves, tree)
         traced = _read(path)
@@ -75,7 +67,8 @@ class _Cached:
         else:
             _register_calls(self.program, inputs[0])
         exported = export.deserialize(bytearray(traced))
-        result = jax.tree.structure((inputs[0], _METRICS))
+        metrics = StepMetrics(*range(len(StepMetrics._fields)))  # for its structure
+        result = jax.tree.structure((inputs[0], metrics))
 
         def call(*inputs: Any) -> Any:
             return jax.tree.unflatten(result, exported.call(*jax.tree.leaves(inputs)))
@@ -93,9 +86,6 @@ class _Cached:
         return bytes(export.export(jax.jit(flat), disabled_checks=unchecked)(*leaves).serialize())
 
 
-_METRICS = StepMetrics(*range(len(StepMetrics._fields)))  # for its structure
-
-
 def _register_calls(program: Program, state: Any) -> None:
     """Registers the functions of the host that the environment's step calls."""
     env, shape = program.env, jax.ShapeDtypeStruct
@@ -107,11 +97,6 @@ def _register_calls(program: Program, state: Any) -> None:
 def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
     """Returns a digest of all that decides the trace, for arguments of these leaves and tree."""
     cfg, env = program.cfg, program.env
-    settings = {
-        key: value
-        for key, value in private_jax.settings().items()
-        if not any(word in key for word in _UNTRACED)
-    }
     parts = (
         dataclasses.replace(cfg, seed=0, preset=""),
         half,
@@ -120,7 +105,7 @@ def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
         (env.any_yaw, env.max_failures),
         object_slots.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
         sorted(provenance.versions().items()),
-        sorted(settings.items()),
+        sorted(item for item in private_jax.settings().items() if not _UNTRACED.search(item[0])),
         compiler.options(cfg),
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
         str(tree),
@@ -134,7 +119,6 @@ def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
 
 @functools.cache
 def _sources() -> str:
-    """Returns a digest of the package's code."""
     digest, root = hashlib.sha256(), Path(csac_jax.__file__).parent
     for path in sorted(root.rglob("*.py")):
         digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
@@ -143,12 +127,11 @@ def _sources() -> str:
 
 def _read(path: Path) -> bytes | None:
     """Reads a file; None if it is missing or damaged."""
-    try:
+    with contextlib.suppress(OSError, zlib.error):
         traced = zlib.decompress(path.read_bytes())  # it has a checksum
         os.utime(path)
-    except (OSError, zlib.error):
-        return None
-    return traced
+        return traced
+    return None
 
 
 def _write(path: Path, traced: bytes) -> None:
@@ -158,6 +141,5 @@ def _write(path: Path, traced: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.write_bytes(zlib.compress(traced, 1))
         temporary.replace(path)
-        newest = sorted(path.parent.iterdir(), key=lambda file: -file.stat().st_mtime)
-        for old in newest[MOST:]:
+        for old in sorted(path.parent.iterdir(), key=lambda file: -file.stat().st_mtime)[MOST:]:
             old.unlink()

@@ -1,8 +1,8 @@
 """Trackers: callbacks that send the log of a run to TensorBoard, Weights & Biases or MLflow.
 
 Every number is a scalar over actions: those of a record by their names, outcomes as
-`outcomes/NAME`, those of an evaluation on the way as `eval/NAME` or `eval/PART/NAME`.
-Each library comes with an extra of its name. A resumed run continues the tracker's run.
+`outcomes/NAME`, those of an evaluation as `eval/NAME` or `eval/PART/NAME`. Each library comes with
+an extra of its name. A resumed run continues the tracker's run.
 """
 
 import dataclasses
@@ -19,8 +19,8 @@ PROJECT = "csac_jax"
 def scalars(record: Record) -> dict[str, float]:
     """Returns the numbers of a record by name, without None."""
     numbers = dataclasses.asdict(record)
-    outcomes = {f"outcomes/{name}": count for name, count in numbers.pop("outcomes").items()}
-    return {name: float(n) for name, n in (numbers | outcomes).items() if n is not None}
+    numbers |= {f"outcomes/{name}": count for name, count in numbers.pop("outcomes").items()}
+    return {name: float(number) for name, number in numbers.items() if number is not None}
 
 
 def eval_scalars(table: dict[str, Any]) -> dict[str, float]:
@@ -54,9 +54,8 @@ class TensorBoard(Tracker):
     def begin(self, run: RunInfo) -> None:
         from tensorboardX import SummaryWriter
 
-        first = run.step * run.cfg.train.scenes + 1
+        first, folder = run.step * run.cfg.train.scenes + 1, str(run.run_dir / "tensorboard")
         suffix = f".{first}"  # a second writer of the same second needs another file name
-        folder = str(run.run_dir / "tensorboard")
         self._writer = SummaryWriter(folder, purge_step=first, filename_suffix=suffix)
 
     def log(self, values: dict[str, float], actions: int) -> None:
@@ -94,16 +93,14 @@ class WandB(Tracker):
 
 
 class MLflow(Tracker):
-    """A run of the experiment `csac_jax`, at MLFLOW_TRACKING_URI or in `mlflow.db` next to the
-    run's folder."""
+    """A run of the experiment `csac_jax`, at MLFLOW_TRACKING_URI or in `mlflow.db` next to RUN."""
 
     def begin(self, run: RunInfo) -> None:
         from mlflow import MlflowClient
 
         default = f"sqlite:///{run.run_dir.resolve().parent / 'mlflow.db'}"
         self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI", default))
-        path = run.run_dir / "mlflow-id"
-        if path.exists():
+        if (path := run.run_dir / "mlflow-id").exists():
             self._id = path.read_text()
             self._client.update_run(self._id, "RUNNING")
         else:

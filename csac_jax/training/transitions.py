@@ -52,10 +52,9 @@ def remember(
     after: environment.State,
     scenes_next: environment.State,
 ) -> tuple[Transition, jax.Array]:
-    """Builds the transitions of actions, leaves [E, ...], with their rewards.
+    """Builds the transitions of actions, leaves [E, ...]; returns also which pushes were good, [E].
 
-    Args: state, the learner's; scenes_next, the scenes acted in next. Returns also which pushes
-    were good, [E] bool.
+    Args: state, the learner's; scenes_next, the scenes acted in next.
     """
     paid = with_reward_outcome(cfg.reward, after)
     result = to_action_result(action, paid.info)
@@ -67,18 +66,14 @@ def remember(
 
 
 def _episodic(after: environment.State, _: environment.State) -> tuple[Observation, jax.Array]:
-    """Returns what follows an action if nothing follows the end of an episode."""
     return after.obs, after.terminated
 
 
 def _continuing(
     after: environment.State, scenes_next: environment.State
 ) -> tuple[Observation, jax.Array]:
-    """Returns what follows an action by Zeng et al., code: `get_label_value`.
-
-    The next scene follows the last action of an episode. Nothing follows an action without effect.
-    Deviation: an episode that is cut off continues in its own scene.
-    """
+    """Returns the next scene after the last action of an episode, nothing after one without effect,
+    as Zeng et al., code: `get_label_value`. Deviation: an episode cut off continues in its own."""
     effect = (after.info.moved > CHANGE_AREA) | (after.info.outcome == Outcome.LIFTED)
     return where(after.terminated, scenes_next.obs, after.obs), ~effect
 
@@ -94,10 +89,7 @@ def where(condition: jax.Array, yes: Any, no: Any) -> Any:
 
 
 def with_reward_outcome(cfg: RewardConfig, after: environment.State) -> environment.State:
-    """Returns states, leaves [...], with the outcome that is paid for, by `reward.outcome_source`.
-
-    Logs and evaluations keep the outcome of ground truth.
-    """
+    """Returns states with the outcome that is paid for; logs keep the true one."""
     if cfg.outcome_source == "simulator":
         return after
     return after.replace(info=after.info.replace(outcome=after.info.outcome_by_gap))
@@ -105,15 +97,9 @@ def with_reward_outcome(cfg: RewardConfig, after: environment.State) -> environm
 
 def to_action_result(action: Action, info: environment.Info) -> ActionResult:
     """Returns what a reward is computed from, leaves [...]; phi is 0, the learner fills it in."""
-    unknown = jnp.zeros_like(info.distance)
+    phi, changed = jnp.zeros_like(info.distance), info.moved > CHANGE_AREA
     return ActionResult(
-        primitive=action.primitive,
-        outcome=info.outcome,
-        distance=info.distance,
-        phi_before=unknown,
-        phi_after=unknown,
-        changed=info.moved > CHANGE_AREA,
-        blocks_lost=info.blocks_lost,
+        action.primitive, info.outcome, info.distance, phi, phi, changed, info.blocks_lost
     )
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,10 +15,10 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
 from csac_jax.config import Config
 from csac_jax.evaluation import metrics
+from csac_jax.evaluation.suites import PreparedSuite
 from csac_jax.io import checkpoint, files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
-from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.training import loop, programs, step
 from tests.training import toys
 
@@ -179,18 +180,19 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     stop = signals.Stop()
     monkeypatch.setattr(signals, "install", lambda: stop)
 
-    def measure(folder: Path, parts: dict, episodes: int, *_) -> dict:
-        assert (parts, episodes) == ({"packed": "packed" in str(folder)}, 4)
+    def measure(folder: Path, suite: PreparedSuite) -> dict:
+        assert (suite.parts, suite.episodes) == ({"packed": "packed" in str(folder)}, 4)
         measured.append(str(folder))
         stop.signal = 15 if len(measured) == 5 else None
         return metrics.summarise(_episodes(4 if "vpg" in str(folder) else 2 + int(folder.name[-1])))
 
-    def environments(cfg: Config, suite: str, *_) -> dict:
-        return {"packed": cfg.scene.packed_fraction == 1.0}
+    def prepare(cfg: Config, suite: str, episodes: int, seed: int, *_) -> PreparedSuite:
+        parts: Any = {"packed": cfg.scene.packed_fraction == 1.0}
+        return PreparedSuite(suite, cfg, parts, episodes, seed)
 
     monkeypatch.setattr(final.policies, "load", lambda folder: folder)
-    monkeypatch.setattr(final.suites, "environments", environments)
-    monkeypatch.setattr(final.rollout, "measure", measure)
+    monkeypatch.setattr(final.suites, "prepare", prepare)
+    monkeypatch.setattr(final.rollout, "evaluate", measure)
     begun = cli.main(["sweep", "smoke", *STUDY.split(), "--evaluate", "4", "--run-dir", "run"])
     assert (begun, len(measured), Path("run/study.md").exists()) == (128 + 15, 5, False)
     stop.signal = None
@@ -215,16 +217,14 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     assert "eval SWEEP: takes --suite and --episodes alone" in capsys.readouterr().err
 
 
-def test_policies_are_measured_with_their_own_robot(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
+def test_policies_are_measured_with_their_own_robot(monkeypatch: pytest.MonkeyPatch):
     """Claim: the final policies of a point are evaluated with the point's robot."""
     seen: list[str] = []
     note = lambda cfg, *_: seen.append(cfg.sim.robot)  # noqa: E731
-    monkeypatch.setattr(final.suites, "environments", note)
+    monkeypatch.setitem(final.suites.SUITES, final.OWN, final.suites.Suite(note))
     for robot in ("ur5", "hand"):
-        point = SweepPoint(robot, {}, presets.smoke().change(sim={"robot": robot}))
-        final._measure_point(4, final.OWN, point, tmp_path, [], signals.Stop())
+        cfg = presets.smoke().change(sim={"robot": robot})
+        final._measure_point(4, final.OWN, cfg, {}, signals.Stop())
     assert seen == ["ur5", "hand"]
 
 

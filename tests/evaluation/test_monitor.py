@@ -80,7 +80,7 @@ def scores(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     given: list[Any] = []
     monkeypatch.setattr(monitor.suites, "prepare", lambda *_, **__: None)
     monkeypatch.setattr(monitor.rollout, "evaluate", lambda *_: given.pop(0))
-    monkeypatch.setattr(policies, "of_state", lambda cfg, state, *_: state)
+    monkeypatch.setattr(policies, "policy_from_state", lambda cfg, state, *_: state)
     yield given
     assert given == []
 

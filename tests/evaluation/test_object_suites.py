@@ -46,7 +46,7 @@ def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_pat
         assert given_up != bool(episodes.completed[row])
         assert not np.any(failed[:-1] & failed[1:]) or given_up
     found = rollout.evaluate(policies.RandomPolicy(env.cfg), prepared)
-    assert found["scenes_sha256"] == rollout.stock.fingerprint(env.cfg.scene, env.scenes)
+    assert found["scenes_sha256"] == rollout.object_slots.fingerprint(env.cfg.scene, env.scenes)
     assert found["declutter_rate"]["n"] == 15
     again = pool.settled(env.cfg, 1, 3, poured=True)
-    assert rollout.stock.fingerprint(env.cfg.scene, again) == found["scenes_sha256"]
+    assert rollout.object_slots.fingerprint(env.cfg.scene, again) == found["scenes_sha256"]

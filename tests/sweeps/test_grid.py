@@ -46,9 +46,9 @@ def test_tasks_are_several_settings():
     unknown one is refused with the nearest."""
     flags = {point.values["task"]: point.cfg for point in _points(["task=clear,target,packed"])}
     assert flags == {
-        "clear": ["--task.kind", "clear", "--scene.packed_fraction", "0.0"],
-        "target": ["--task.kind", "target", "--scene.packed_fraction", "0.0"],
-        "packed": ["--task.kind", "clear", "--scene.packed_fraction", "1.0"],
+        "clear": ["--task.kind", "clear", "--scene.packed-fraction", "0.0"],
+        "target": ["--task.kind", "target", "--scene.packed-fraction", "0.0"],
+        "packed": ["--task.kind", "clear", "--scene.packed-fraction", "1.0"],
     }
     with pytest.raises(ValueError, match="unknown task 'pack'; did you mean packed"):
         _points(["task=pack"])
