@@ -115,7 +115,7 @@ def _search() -> dict[str, dict[str, Groups]]:
 
 def _pushes() -> dict[str, dict[str, Groups]]:
     folders = [
-        f"4/reward.push_label={effect},reward.success_bonus={bonus},target.gamma={gamma},task=packed"
+        f"4/reward.push_effect={effect},reward.success_bonus={bonus},target.gamma={gamma},task=packed"
         for effect, bonus, gamma in itertools.product(("value", "renewed"), "01", ("0.2", "0.5"))
     ]
     return {

@@ -194,6 +194,7 @@ def _add_run(file: Path, path: Path, results: Results) -> None:
     """Adds the run of a log, or a note where it has no config or no grasp yet."""
     config = _read_json(file.parent / files.CONFIG)
     _check(config, _CONFIG, files.CONFIG)
+    config = renames.current(config)
     with warnings.catch_warnings(record=True) as damage:
         warnings.simplefilter("always")
         lines = files.read_log(file)
@@ -224,7 +225,7 @@ def _record(folder: Path, config: Json) -> Json:
     for place in (folder, *above):
         record = _read_json(place / RECORD)
         _check(record, _RECORD, RECORD)
-        if record and record.get("config", config) == config:
+        if record and renames.current(record.get("config", config)) == config:
             return record
     return {}
 
@@ -243,7 +244,8 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
     _check(record, _RECORD, "the file")
     for part in parts.values():
         _check_part(part)
-    config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
+    config = renames.current(content["config"])
+    policy, seed = content["policy"], content.get("seed", 0)
     asked = path, config, _variant(file, path, config), policy, suite
     return [
         Evaluation(*asked, name, seed, _per_episode(part) | part, record)

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from csac_jax import algorithms, presets
+from csac_jax.config import Config
 from csac_jax.io import configs
 
 NAMES = {
@@ -47,7 +48,7 @@ class Variant:
 
 def variant(config: Json) -> Variant:
     """Builds the variant of a recorded config. Missing settings count as the preset's."""
-    preset, algo = config.get("preset", ""), configs.algorithm(config)
+    preset, algo = config.get("preset", ""), config.get("algo", Config.algo)
     base: Json = {}
     with contextlib.suppress(ValueError):  # the preset or the algorithm is gone
         base = _preset_settings(preset, algo)
