@@ -43,7 +43,7 @@ SMALL_NET = {
 
 
 def quick() -> Config:
-    """Learns to clear five blocks on a 2-core CPU; the measurements are in experiments/results.
+    """Learns to clear five blocks on a 2-core CPU; docs/results.md has its results.
 
     Blocks of one shape are alike in size, density and friction. Discount and the end of the Beta
     law are not the literature's; neither is shown to be needed. Two cores can afford few passes:
@@ -166,7 +166,7 @@ def paper() -> Config:
     action; places are explored by action noise alone, and nothing is augmented. Where the paper is
     silent: tau of SD3, two pixels per cell and two transitions per update, as many as in VPG, one
     of them for the actor. Cells with nothing to act on are left out (ours).
-    Result: experiments/results/paper.
+    Result: docs/results.md.
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
     updates = {"batch": 2, "actor_batch": 1, "updates_per_step": 1, "augment": False, "tau": 0.005}

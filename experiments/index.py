@@ -5,18 +5,23 @@ A record says what it shows by its key `about`; an archive by the file about.jso
 
 import functools
 import json
+import re
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from csac_jax.io import files
-from csac_jax.report import result_tables, results
+from csac_jax.report import result_tables, results, variants
 from csac_jax.report.results import Results
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments" / "results"
 ABOUT = "about.json"
+COMMANDS = (
+    "Commands of benchmarks are those of the record's commit: settings and benchmarks may have had "
+    "other names then. Commands of runs and evaluations are those of today."
+)
 
 
 @functools.cache
@@ -35,7 +40,7 @@ def record(name: str) -> Any:
 def page() -> str:
     """Returns the index: a row per folder of runs and per benchmark."""
     rows = [*_folders(), *_benchmarks()]
-    return f"# Recorded results\n\n{result_tables.table_text(rows)}\n"
+    return f"# Recorded results\n\n{COMMANDS}\n\n{result_tables.table_text(rows)}\n"
 
 
 def _folders() -> Iterator[dict[str, str]]:
@@ -61,9 +66,8 @@ def _below(recorded: Results, folder: Path) -> Results:
 
 def _commands(found: Results) -> list[str]:
     """Returns how the runs of a folder were trained, then evaluated."""
-    trained = {
-        run.command.replace(f"--seed {run.config['seed']}", "--seed K") for run in found.runs
-    }
+    commands = (variants.train_command(run.config) for run in found.runs)
+    trained = {re.sub(r"--seed \d+", "--seed K", command) for command in commands}
     config = found.runs[0].config if found.runs else None
     measured = dict.fromkeys(one.command(config) for one in found.evaluations)
     return [f"`{command}`" for command in (*sorted(trained), *measured)]

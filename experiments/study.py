@@ -115,7 +115,7 @@ def _search() -> dict[str, dict[str, Groups]]:
 
 def _pushes() -> dict[str, dict[str, Groups]]:
     folders = [
-        f"4/reward.push_label={effect},reward.success_bonus={bonus},target.gamma={gamma},task=packed"
+        f"4/reward.push_effect={effect},reward.success_bonus={bonus},target.gamma={gamma},task=packed"
         for effect, bonus, gamma in itertools.product(("value", "renewed"), "01", ("0.2", "0.5"))
     ]
     return {
@@ -174,8 +174,8 @@ def area(run: RecordedRun) -> float:
 
 def actions_to_good(run: RecordedRun) -> float:
     """Returns the actions until nine of ten grasps lift; all where they never do."""
-    line = result_tables.first_good(run)
-    return float(run.actions[-1 if line is None else line])
+    good = result_tables.first_good(run, run.actions)
+    return float(run.actions[-1]) if good is None else good
 
 
 def holm(p_values: Sequence[float], alpha: float = ALPHA) -> list[bool]:

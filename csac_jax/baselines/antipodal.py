@@ -29,7 +29,8 @@ CANDIDATES = 1024  # best grasps, of which the best within reach is chosen
 
 @struct.dataclass
 class Weights:
-    """Costs of a grasp's flaws (ours)."""
+    """Costs of a grasp's flaws, ours; the noise only helps where two failures do not end the
+    episode."""
 
     tilt: float = 2.0  # of an edge against the pad, per rad
     offset: float = 10.0  # of the held part's middle from the hand's, along the closing, per m

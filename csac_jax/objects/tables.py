@@ -14,7 +14,9 @@ from csac_jax.objects.library import Library, LibraryError, Split
 
 CHUNK = 6  # faces, as many as a box has
 NO_FACE = 1e3  # m, offset of a padding face: every point lies inside it
-PROCEDURAL = re.compile(r"procedural(\+assemblies)?:(\d{1,9}):(\d{1,4})")
+PROCEDURAL = re.compile(
+    r"(procedural(\+assemblies)?|made|mixed):\d{1,9}:\d{1,4}"
+)  # or a former name
 
 
 class Tables(NamedTuple):
@@ -52,7 +54,7 @@ def _draw(source: str) -> Library:
     _, seed, count = source.split(":")
     if not 1 <= int(count) <= library.MOST_OBJECTS:
         raise LibraryError(f"{source}: 1 to {library.MOST_OBJECTS} objects can be made")
-    draw = shapes.draw_mixed if "+" in source else shapes.draw
+    draw = shapes.draw_mixed if "+" in source or "mixed" in source else shapes.draw
     return library.from_objects(draw(int(seed), int(count)))
 
 

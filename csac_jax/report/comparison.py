@@ -50,10 +50,10 @@ class Curve(NamedTuple):
         """Divides sums of totals over all of training; None where a run lacks some."""
         if not all(run.totals.keys() >= {*above, *below} for run in self.runs):
             return None
-        over, under = (
-            np.array([sum(run.totals[name] for name in names) for run in self.runs])
-            for names in (above, below)
-        )
+        rows = [
+            [sum(run.totals[n] for n in names) for run in self.runs] for names in (above, below)
+        ]
+        over, under = map(np.array, rows)
         return statistics.band([self.by_seed(over / under)]) if under.all() else None
 
     def points(self) -> tuple[np.ndarray, list[Band]]:
@@ -109,16 +109,14 @@ class Score(NamedTuple):
         """
         counted = [_with_cases(runs, metric) for runs in self.parts.values()]
         if [len(runs) for runs in counted] == [1]:
-            share = counted[0][0].metrics[metric]
-            return Band(share["value"], share["low"], share["high"], 1)
+            return Band(**counted[0][0].metrics[metric])._replace(n=1)
         return statistics.band(self.strata(metric)) if all(counted) else None
 
     def strata(self, metric: str) -> list[list[np.ndarray]]:
         """Returns the values of the runs with cases: per part and seed an array [hosts]."""
-        counted = [_with_cases(runs, metric) for runs in self.parts.values()]
         return [
             statistics.by_seed(seeds_of(runs), [one.metrics[metric]["value"] for one in runs])
-            for runs in counted
+            for runs in (_with_cases(runs, metric) for runs in self.parts.values())
         ]
 
 
@@ -154,9 +152,8 @@ def build(results: Results, reference: str | None = None) -> ResultReport:
     algorithms = sorted({one.variant.algo for one in (*curves, *scores)})
     if reference is not None and reference not in algorithms:
         raise ValueError(f"no result of {reference}; there are: {', '.join(algorithms) or 'none'}")
-    notes = [note for curve in curves for note in _curve_notes(curve)]
-    all_notes = [*results.notes, *notes]
-    return ResultReport(curves, scores, results, all_notes, reference or REFERENCE)
+    notes = [*results.notes, *(note for curve in curves for note in _curve_notes(curve))]
+    return ResultReport(curves, scores, results, notes, reference or REFERENCE)
 
 
 def grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
@@ -176,12 +173,11 @@ def _score_key(one: Evaluation) -> tuple[Any, ...]:
 
 
 def _curve_notes(curve: Curve) -> Iterator[str]:
-    if len(ends := curve.ends) > 1:
-        several = ", ".join(f"{end:,}" for end in ends)
-        drawn = f"their curve is drawn up to {ends[0]:,}"
-        yield f"{label(curve.variant)}: runs end at {several} actions; {drawn}"
+    name, ends = label(curve.variant), [f"{end:,}" for end in curve.ends]
+    if len(ends) > 1:
+        yield f"{name}: runs end at {', '.join(ends)} actions; their curve is drawn up to {ends[0]}"
     if len(curve.runs) < 2:
-        yield f"{label(curve.variant)}: one run only, so its curve has no band"
+        yield f"{name}: one run only, so its curve has no band"
 
 
 def _pairs(
@@ -199,10 +195,10 @@ def pairs(report: ResultReport) -> Iterator[tuple[Score, Score]]:
 
     Both were measured in the same scenes, with several seeds.
     """
-    learned = [score for score in report.scores if score.policy == "learned"]
     several = [
-        s.only(*(part for part, runs in s.parts.items() if len(set(seeds_of(runs))) > 1))
-        for s in learned
+        score.only(*(part for part, runs in score.parts.items() if len(set(seeds_of(runs))) > 1))
+        for score in report.scores
+        if score.policy == "learned"
     ]
     alike = operator.attrgetter("variant.preset", "suite", "world", "episodes")
     measured = [score for score in several if score.parts]
@@ -213,9 +209,9 @@ def pairs(report: ResultReport) -> Iterator[tuple[Score, Score]]:
 
 def curve_pairs(report: ResultReport) -> Iterator[tuple[Curve, Curve]]:
     """Yields the reference and another variant that was trained alike, of several seeds both."""
-    for ours, theirs in _pairs(report.curves, report.reference, _training_key):
-        if min(len(ours.final), len(theirs.final)) > 1:
-            yield ours, theirs
+    for pair in _pairs(report.curves, report.reference, _training_key):
+        if all(len(curve.final) > 1 for curve in pair):
+            yield pair
 
 
 def compared(

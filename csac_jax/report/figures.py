@@ -61,19 +61,20 @@ def draw(report: ResultReport) -> Iterator[Chart]:
         if plain:
             yield Chart(f"methods-{preset}", f"Training of {preset}: methods", training(plain))
         if varied:
-            both = [*base, *varied]
-            yield Chart(f"variants-{preset}", f"Training of {preset}: variants", training(both))
+            figure = training([*base, *varied])
+            yield Chart(f"variants-{preset}", f"Training of {preset}: variants", figure)
     by_suite = grouped(report.scores, lambda score: (score.suite, score.variant.preset))
     for (suite, preset), scores in by_suite.items():
+        title = f"{suite}, preset {preset}"
         if len(scores) <= MOST_SCORES and (len(scores) > 1 or len(scores[0].parts) > 1):
             kind = "four-cases" if suite in ("cases", "target") else "suite"
-            yield Chart(
-                f"{kind}-{suite}-{preset}", f"Suite {suite}, preset {preset}", _suite(scores)
-            )
+            yield Chart(f"{kind}-{suite}-{preset}", f"Suite {title}", _suite(scores))
         several = [score for score in scores if score.policy == "learned" and score.seeds > 1]
         if 1 < len(several) <= MOST_SCORES:
-            title = f"Performance profiles, suite {suite}, preset {preset}"
-            yield Chart(f"profiles-{suite}-{preset}", title, _profiles(several))
+            figure = _profiles(several)
+            yield Chart(
+                f"profiles-{suite}-{preset}", f"Performance profiles, suite {title}", figure
+            )
 
 
 def training(curves: Sequence[Curve]) -> Figure:
@@ -86,16 +87,25 @@ def training(curves: Sequence[Curve]) -> Figure:
     figure, panels = plt.subplots(
         len(groups), figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
-    lows = []
     for panel, group in zip(panels.flat, groups, strict=True):
         algorithms = [curve.variant.algo for curve in group]
-        lows += [_line(panel, curve, _colour(algorithms, i)) for i, curve in enumerate(group)]
-        panel.grid(alpha=0.3)
+        for index, curve in enumerate(group):
+            actions, bands = curve.points()
+            name = textwrap.fill(f"{_short(curve.variant)} ({len(curve.runs)})", NAME_WIDTH)
+            _shaded(panel, actions, bands, color=_colour(algorithms, index), label=name)
         panel.legend(**LEGEND)
-    panels[0, 0].set(xlim=(0, None), ylim=(axis_start(min(lows)), 101))
+    panels[0, 0].set(xlim=(0, None), ylim=(None, 101))
     figure.supxlabel("actions", fontsize="medium")
     figure.supylabel("success over the last 200 grasps, %", fontsize="medium")
     return figure
+
+
+def _shaded(panel: Axes, x: Any, bands: Sequence[Band | None], **style: Any) -> None:
+    """Draws a line through values, %, and shades their intervals."""
+    value, low, high = percent(bands)
+    panel.plot(x, value, **style)
+    panel.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    panel.grid(alpha=0.3)
 
 
 def _colour(algorithms: Sequence[str], index: int) -> str:
@@ -107,17 +117,6 @@ def _colour(algorithms: Sequence[str], index: int) -> str:
     return [*spare, GREY][index % (len(spare) + 1)]
 
 
-def _line(panel: Axes, curve: Curve, colour: str) -> float:
-    """Draws a variant; returns its lowest value, %."""
-    actions, bands = curve.points()
-    value, low, high = percent(bands)
-    name = f"{_short(curve.variant)} ({len(curve.runs)})"
-    panel.plot(actions, value, color=colour, label=textwrap.fill(name, NAME_WIDTH))
-    if len(curve.runs) > 1:
-        panel.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
-    return lowest([value, low])
-
-
 def _short(variant: Variant) -> str:
     return textwrap.shorten(label(variant, preset=False, most=3), LONGEST, placeholder=" ...")
 
@@ -125,21 +124,20 @@ def _short(variant: Variant) -> str:
 def _suite(scores: Sequence[Score]) -> Figure:
     """Draws completion and action efficiency by part and variant."""
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
-    lows = []
     for panel, (metric, title) in zip(panels, SUITE_METRICS.items(), strict=True):
-        lows.append(_marks(panel, metric, scores))
+        _marks(panel, metric, scores)
         panel.set(title=title)
         panel.grid(alpha=0.3, axis="y")
-    panels[0].set(ylabel="%", ylim=(axis_start(min(lows)), 104))
+    panels[0].set(ylabel="%", ylim=(None, 104))
     _legend_below(figure, panels[0])
     return figure
 
 
-def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> float:
-    """Draws a mark of each variant in each part and in their mean; returns the lowest value, %."""
+def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> None:
+    """Draws a mark of each variant in each part and in their mean."""
     parts = list(dict.fromkeys(part for score in scores for part in score.parts))
     ticks = [*parts, "mean"] if len(parts) > 1 else parts
-    places, lows = np.arange(len(ticks)), []
+    places = np.arange(len(ticks))
     for index, score in enumerate(scores):
         bands = [score.only(part).band(metric) for part in parts]
         if len(parts) > 1:
@@ -149,25 +147,19 @@ def _marks(panel: Axes, metric: str, scores: Sequence[Score]) -> float:
         offset = (index + 0.5) * 0.8 / len(scores) - 0.4
         fmt, style = MARKERS[index % len(MARKERS)], _style(scores, index)
         panel.errorbar(places + offset, value, error, fmt=fmt, capsize=3, **style)
-        lows.append(lowest([value, low]))
     panel.set_xticks(places, ticks)
     panel.set_xlim(-0.5, len(ticks) - 0.5)
-    return min(lows)
 
 
 def _profiles(scores: Sequence[Score]) -> Figure:
     """Draws the share of the seeds above each value, mean of the parts, arXiv:2108.13264."""
     figure, panels = plt.subplots(1, 2, figsize=(11.0, 4.2), sharey=True, layout="constrained")
     for panel, (metric, title) in zip(panels, SUITE_METRICS.items(), strict=True):
-        left = 100.0
-        for index, score in enumerate(scores):
-            value, low, high = percent(statistics.profile(score.strata(metric), PROFILED))
-            style = _style(scores, index)
-            panel.plot(100 * PROFILED, value, **style)
-            panel.fill_between(100 * PROFILED, low, high, color=style["color"], alpha=0.15)
-            left = min(left, 100 * PROFILED[np.argmax(value < 100.0)])
-        panel.set(xlabel=f"{title}, %", xlim=(axis_start(left), 100), ylim=(0, 101))
-        panel.grid(alpha=0.3)
+        shares = [statistics.profile(score.strata(metric), PROFILED) for score in scores]
+        for index, share in enumerate(shares):
+            _shaded(panel, 100 * PROFILED, share, **_style(scores, index))
+        least = min(np.argmax([band.value < 1.0 for band in share]) for share in shares)
+        panel.set(xlabel=f"{title}, %", xlim=(100 * PROFILED[least] - 2, 100), ylim=(0, 101))
     panels[0].set_ylabel("seeds above, %")
     _legend_below(figure, panels[0])
     return figure
@@ -197,9 +189,9 @@ def study(rows: Sequence[StudyRow]) -> Figure:
     figure, panels = plt.subplots(
         *shape, figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained"
     )
-    for column, (task, own) in zip(panels.T, by_task.items(), strict=True):
+    for column, (task, of_task) in zip(panels.T, by_task.items(), strict=True):
         for panel, metric in zip(column, PANELS, strict=True):
-            _study_lines(panel, metric, own)
+            _study_lines(panel, metric, of_task)
         column[0].set_title(task)
         column[-1].set_xlabel("actions of training")
     for panel, title in zip(panels[:, 0], PANELS.values(), strict=True):
@@ -210,25 +202,11 @@ def study(rows: Sequence[StudyRow]) -> Figure:
 
 def _study_lines(panel: Axes, metric: str, rows: Sequence[StudyRow]) -> None:
     spare = itertools.cycle(PALETTE)
-    for method, own in grouped(rows, lambda row: row.method).items():
-        colour = COLOURS.get(own[0].algo) if "," not in method else None
-        actions = [row.actions for row in own]
-        value, low, high = percent([row.score.band(metric) for row in own])
-        colour = colour or next(spare)
-        panel.plot(actions, value, "o-", color=colour, label=method)
-        panel.fill_between(actions, low, high, color=colour, alpha=0.15, linewidth=0)
-    panel.grid(alpha=0.3)
-
-
-def lowest(values: Any) -> float:
-    """Returns the lowest finite value, %; 100 without any."""
-    finite = np.isfinite(values)
-    return float(np.min(np.asarray(values)[finite], initial=100.0))
-
-
-def axis_start(percentage: float) -> float:
-    """Returns where an axis begins, %: a whole ten a little below the data."""
-    return max(10.0 * np.floor((percentage - 1.0) / 10.0), 0.0)
+    for method, of_method in grouped(rows, lambda row: row.method).items():
+        named = COLOURS.get(of_method[0].score.variant.algo) if "," not in method else None
+        bands = [row.score.band(metric) for row in of_method]
+        style = {"color": named or next(spare), "marker": "o", "label": method}
+        _shaded(panel, [row.actions for row in of_method], bands, **style)
 
 
 def percent(bands: Sequence[Band | None]) -> np.ndarray:

@@ -8,11 +8,11 @@ import itertools
 import mimetypes
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import csac_jax
 from csac_jax.report import figures, result_tables, results
-from csac_jax.report.comparison import ResultReport
+from csac_jax.report.comparison import ResultReport, grouped
 from csac_jax.report.result_tables import ResultTable
 from csac_jax.report.variants import label
 
@@ -23,21 +23,6 @@ FOLDED = ("Differences in training", "Differences", "Failures", "Provenance")
 MEDIA = {".png": "image", ".gif": "image", ".webp": "image", ".jpg": "image", ".mp4": "video"}
 LARGEST = 8 * 2**20  # bytes of a picture or video that the page takes up
 MOST_MEDIA = 12
-
-
-class TableCell(NamedTuple):
-    """A cell of a table of the page."""
-
-    text: str
-    best: bool
-
-
-class Medium(NamedTuple):
-    """A picture or video."""
-
-    kind: str  # image or video
-    name: str
-    data: str  # as a URL
 
 
 def write(report: ResultReport, paths: Sequence[Path], folder: Path) -> list[Path]:
@@ -74,49 +59,43 @@ def render(report: ResultReport, paths: Sequence[Path]) -> str:
     )
 
 
-def _cells(report: ResultReport, table: ResultTable) -> list[list[TableCell]]:
-    """Returns the rows of a table, the best values marked; the first row is its head."""
+def _cells(report: ResultReport, table: ResultTable) -> list[list[tuple[str, bool]]]:
+    """Returns the rows of a table as (text, is best); the first row is its head."""
     variants = (one.variant for one in (*report.curves, *report.scores))
     best = _best(table, {label(one): one.preset for one in variants})
-    head = [TableCell(column, False) for column in table[0]]
-    return [head] + [
-        [TableCell(text, (i, column) in best) for column, text in row.items()]
-        for i, row in enumerate(table)
-    ]
+    rows = ([(row[name], (i, name) in best) for name in row] for i, row in enumerate(table))
+    return [[(name, False) for name in table[0]], *rows]
 
 
 def _best(table: ResultTable, presets: dict[str, str]) -> set[tuple[int, str]]:
     """Finds row and column of the largest values among methods of the same preset and scenes."""
-    alike: dict[Any, list[int]] = {}
-    for i, row in enumerate(table):
-        name = next(iter(row.values()))
-        if name in presets:
-            place = presets[name], row.get("part"), row.get("physics, robot, seed")
-            alike.setdefault(place, []).append(i)
+
+    def alike(i: int) -> tuple[Any, ...] | None:
+        name, *_ = table[i].values()
+        place = presets.get(name), table[i].get("part"), table[i].get("physics, robot, seed")
+        return place if name in presets else None
+
     best = set()
-    for column, rows in itertools.product(BETTER & set(table[0]), alike.values()):
-        values = {i: _number(table[i][column]) for i in rows}
-        known = {i: value for i, value in values.items() if value is not None}
-        if len(known) > 1:
-            best |= {(i, column) for i, value in known.items() if value == max(known.values())}
+    for place, rows in grouped(range(len(table)), alike).items():
+        for column in BETTER & set(table[0]) if place else ():
+            values = {i: _number(table[i][column]) for i in rows if table[i][column] != "-"}
+            if len(values) > 1:
+                best |= {(i, column) for i in values if values[i] == max(values.values())}
     return best
 
 
-def _number(text: str) -> float | None:
-    """Returns the number that a cell begins with."""
-    try:
-        return float(text.split()[0].replace(",", ""))
-    except (ValueError, IndexError):
-        return None
+def _number(text: str) -> float:
+    return float(text.split()[0].replace(",", ""))
 
 
-def media(paths: Iterable[Path]) -> Iterator[Medium]:
-    """Yields the first few pictures and videos in these folders and the folders in them."""
+def media(paths: Iterable[Path]) -> Iterator[tuple[str, str, str]]:
+    """Yields kind (image or video), name and data, as a URL, of the first few pictures and videos
+    in these folders and the folders in them."""
     folders = [path for path in paths if path.is_dir()]
-    below = (sorted(one for one in folder.rglob("*") if _is_medium(one)) for folder in folders)
+    below = (sorted(filter(_is_medium, folder.rglob("*"))) for folder in folders)
     for path in itertools.islice(itertools.chain.from_iterable(below), MOST_MEDIA):
         kind = mimetypes.guess_type(path.name)[0] or "image/webp"
-        yield Medium(MEDIA[path.suffix], str(path), _url(kind, path.read_bytes()))
+        yield MEDIA[path.suffix], str(path), _url(kind, path.read_bytes())
 
 
 def _is_medium(path: Path) -> bool:

@@ -19,7 +19,7 @@ from csac_jax.report.comparison import (
     seeds_of,
 )
 from csac_jax.report.results import METRICS, RecordedRun
-from csac_jax.report.variants import Json, Variant, label
+from csac_jax.report.variants import Json, Variant, label, train_command
 
 GOOD = 0.9  # grasp success whose time is reported
 LAST = "final success"
@@ -51,15 +51,10 @@ EXPLAINED = (
 ResultTable = list[dict[str, str]]  # rows; column -> cell
 
 
-def first_good(run: RecordedRun) -> int | None:
-    """Returns the line of a log at which the success of a full window first is GOOD."""
-    good = np.flatnonzero((run.success >= GOOD) & (run.grasps >= GRASP_WINDOW))
-    return int(good[0]) if good.size else None
-
-
-def _time_to_good(run: RecordedRun) -> float | None:
-    line = first_good(run)
-    return None if line is None else float(run.seconds[line])
+def first_good(run: RecordedRun, column: np.ndarray) -> float | None:
+    """Returns the value of a column of a log where the success of a full window first is GOOD."""
+    good = column[(run.success >= GOOD) & (run.grasps >= GRASP_WINDOW)]
+    return float(good[0]) if good.size else None
 
 
 def as_json(report: ResultReport) -> Json:
@@ -69,17 +64,9 @@ def as_json(report: ResultReport) -> Json:
         "curves": [_curve_json(curve) for curve in report.curves],
         "scores": [_score_json(score, part) for score in report.scores for part in score.parts],
         "training_differences": [
-            {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
-            | _plain(_training_gaps(ours, theirs))
-            for ours, theirs in curve_pairs(report)
+            _both(*pair) | _plain(_training_gaps(*pair)) for pair in curve_pairs(report)
         ],
-        "differences": [
-            {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
-            | {"suite": ours.suite, "parts": list(ours.parts), "world": ours.world}
-            | {"metrics": _plain(compared(ours, theirs, statistics.difference, METRICS))}
-            | {"improvement": _plain(compared(ours, theirs, statistics.improvement, IMPROVED))}
-            for ours, theirs in pairs(report)
-        ],
+        "differences": [_difference_json(*pair) for pair in pairs(report)],
         "provenance": provenance(report),
         "notes": report.notes,
     }
@@ -89,7 +76,7 @@ def _curve_json(curve: Curve) -> Json:
     actions, success = curve.points()
     return _named(curve.variant) | {
         "seeds": sorted(curve.seeds),
-        "seconds_to_90": [_time_to_good(run) for run in curve.runs],
+        "seconds_to_90": [first_good(run, run.seconds) for run in curve.runs],
         "seconds": [float(run.seconds[-1]) for run in curve.runs],
         "actions": actions.tolist(),
         "success": [band._asdict() for band in success],
@@ -105,9 +92,22 @@ def _score_json(score: Score, part: str) -> Json:
     return _named(fields.pop("variant")) | fields | {"metrics": metrics}
 
 
+def _difference_json(ours: Score, theirs: Score) -> Json:
+    return _both(ours, theirs) | {
+        "suite": ours.suite,
+        "parts": list(ours.parts),
+        "world": ours.world,
+        "metrics": _plain(compared(ours, theirs, statistics.difference, METRICS)),
+        "improvement": _plain(compared(ours, theirs, statistics.improvement, IMPROVED)),
+    }
+
+
+def _both(ours: Curve | Score, theirs: Curve | Score) -> Json:
+    return {"ours": _named(ours.variant), "theirs": _named(theirs.variant)}
+
+
 def _named(variant: Variant) -> Json:
-    named = {"preset": variant.preset, "algo": variant.algo}
-    return named | {"changed": dict(variant.changed)}
+    return {"preset": variant.preset, "algo": variant.algo, "changed": dict(variant.changed)}
 
 
 def _plain(bands: Mapping[str, Band | None]) -> Json:
@@ -145,7 +145,7 @@ def _training_row(curve: Curve) -> dict[str, str]:
         LAST: shown(statistics.band([curve.final])),
         AREA: shown(statistics.band([curve.area])),
         **{name: shown(band, metric=metric) for name, (band, metric) in rates.items()},
-        "time to 90 %": _times([_time_to_good(run) for run in curve.runs]),
+        "time to 90 %": _times([first_good(run, run.seconds) for run in curve.runs]),
         "training time": _times([float(run.seconds[-1]) for run in curve.runs]),
     }
 
@@ -194,8 +194,12 @@ def evaluation(report: ResultReport) -> ResultTable:
 def _evaluation_row(score: Score) -> dict[str, str]:
     runs = sum(map(len, score.parts.values()))
     counts = {"runs": str(score.most_runs), "episodes": str(score.episodes * runs)}
-    values = {title: shown(score.band(key), metric=key) for key, title in METRICS.items()}
-    return {"policy": score.name, **_place_cells(score), **counts, **values}
+    return {"policy": score.name, **_place_cells(score), **counts, **metric_cells(score)}
+
+
+def metric_cells(score: Score) -> dict[str, str]:
+    """Returns the metrics of a score by their titles."""
+    return {title: shown(score.band(key), metric=key) for key, title in METRICS.items()}
 
 
 def differences(report: ResultReport) -> ResultTable:
@@ -245,7 +249,7 @@ def _place_cells(score: Score) -> dict[str, str]:
 
 def provenance(report: ResultReport) -> ResultTable:
     """Builds the table of where numbers come from, a row per file."""
-    runs = {run.path: (run.command, run.record) for run in report.results.runs}
+    runs = {run.path: (train_command(run.config), run.record) for run in report.results.runs}
     trained = {run.path.parent: run.config for run in report.results.runs}
     measured = {
         one.path: (one.command(trained.get(one.path.parent)), one.record)

@@ -40,15 +40,14 @@ TOTALS = ("pushes", "grasps", "lifted", "cleared", "terminated", "truncated")
 """Sums of a training log; `lifted` is one of `outcomes`."""
 
 # What a record may hold: key -> the types of its value, or the shape of an object.
-_TEXT: Any = (str, type(None))
-_NUMBER: Any = (int, float, type(None))
+_TEXT: Any = str | None
+_NUMBER: Any = int | float | None
 _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
-_RECORD = {"device": _TEXT, "versions": (dict, type(None)), "commit": _TEXT}
-_RECORD |= {"wall_seconds": _NUMBER}
+_RECORD = {"device": _TEXT, "versions": dict | None, "commit": _TEXT, "wall_seconds": _NUMBER}
 _COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
 _METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS, "failures": {}}
-_EVALUATION = {"policy": str, "suite": str, "seed": int, "seconds": _NUMBER, "parts": {}}
+_EVALUATION = {"policy": str, "suite": str, "seed": int, "config": _CONFIG, "parts": {}}
 
 
 class RecordedRun(NamedTuple):
@@ -63,11 +62,6 @@ class RecordedRun(NamedTuple):
     seconds: np.ndarray  # [n] of training, without compilation
     record: Json  # wall_seconds; device, versions and commit if `train` wrote them
     totals: dict[str, int]  # sums over the run, those of TOTALS that were recorded
-
-    @property
-    def command(self) -> str:
-        """Returns the command that trains such a run."""
-        return variants.train_command(self.config)
 
 
 class Evaluation(NamedTuple):
@@ -86,10 +80,9 @@ class Evaluation(NamedTuple):
     def command(self, trained: Json | None = None) -> str:
         """Returns the command of this evaluation for a policy with the config `trained`."""
         episodes = self.metrics.get("counts", {}).get("episodes")
-        asked = self.policy, self.suite, episodes, self.seed, self.config
-        return variants.eval_command(*asked) + variants.eval_options(
-            self.config, trained or self.config
-        )
+        asked = f"--policy {self.policy} --suite {self.suite} --episodes {episodes}"
+        asked += f" --seed {self.seed}"
+        return variants.eval_command(asked, self.config, trained or self.config)
 
 
 class Results(NamedTuple):
@@ -139,9 +132,8 @@ def _opened(path: Path) -> Iterator[Path]:
 def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Writes a regular file of an archive; skips links and what would lie elsewhere."""
     place = (folder / member.name).resolve()
-    sound = member.isreg() and member.size <= files.LARGEST
-    content = archive.extractfile(member) if sound else None
-    if content is not None and place.is_relative_to(folder):
+    sound = member.isreg() and member.size <= files.LARGEST and place.is_relative_to(folder)
+    if sound and (content := archive.extractfile(member)):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content.read())
 
@@ -153,8 +145,9 @@ def _files(path: Path) -> Iterator[Path]:
         yield path
     for folder, names, contents in os.walk(path):
         names[:] = sorted(set(names) - set(SKIPPED))
-        logs = (name for name in sorted(contents) if name.endswith((files.METRICS, ".json")))
-        yield from (Path(folder, name) for name in logs)
+        for name in sorted(contents):
+            if name.endswith((files.METRICS, ".json")):
+                yield Path(folder, name)
 
 
 def _add(file: Path, path: Path, results: Results) -> None:
@@ -170,9 +163,10 @@ def _add(file: Path, path: Path, results: Results) -> None:
 
 def _read_json(path: Path) -> Json:
     """Reads the object in a file; empty where it holds none."""
-    with contextlib.suppress(OSError, ValueError):
+    try:
         return files.read_object(path)
-    return {}
+    except (OSError, ValueError):
+        return {}
 
 
 def _check(content: Any, shape: Json, name: str) -> None:
@@ -194,21 +188,21 @@ def _add_run(file: Path, path: Path, results: Results) -> None:
     """Adds the run of a log, or a note where it has no config or no grasp yet."""
     config = _read_json(file.parent / files.CONFIG)
     _check(config, _CONFIG, files.CONFIG)
+    config = renames.current(config)
     with warnings.catch_warnings(record=True) as damage:
         warnings.simplefilter("always")
         lines = files.read_log(file)
     results.notes.extend(str(warning.message).replace(str(file), str(path)) for warning in damage)
     grasped = [line for line in lines if line.get("grasp_success") is not None]
-    if not config:
-        results.notes.append(f"{path}: no readable {files.CONFIG} in its folder; left out")
-    elif not grasped:
-        results.notes.append(f"{path}: no grasp is recorded yet; left out")
-    else:
-        names = ("actions", "grasp_success", "grasps_counted", "seconds")
-        columns = [np.array([line[name] for line in grasped], float) for name in names]
-        record = {"wall_seconds": float(columns[-1][-1]), **_record(file.parent, config)}
-        fields = (path, config, _variant(file, path, config), *columns, record, _totals(lines))
-        results.runs.append(RecordedRun._make(fields))
+    if not (config and grasped):
+        lacking = "no grasp is recorded yet" if config else f"no readable {files.CONFIG} next to it"
+        results.notes.append(f"{path}: {lacking}; left out")
+        return
+    names = ("actions", "grasp_success", "grasps_counted", "seconds")
+    columns = [np.array([line[name] for line in grasped], float) for name in names]
+    record = {"wall_seconds": float(columns[-1][-1]), **_record(file.parent, config)}
+    fields = (path, config, _variant(file, path, config), *columns, record, _totals(lines))
+    results.runs.append(RecordedRun._make(fields))
 
 
 def _totals(lines: Sequence[Json]) -> dict[str, int]:
@@ -224,7 +218,7 @@ def _record(folder: Path, config: Json) -> Json:
     for place in (folder, *above):
         record = _read_json(place / RECORD)
         _check(record, _RECORD, RECORD)
-        if record and record.get("config", config) == config:
+        if record and renames.current(record.get("config", config)) == config:
             return record
     return {}
 
@@ -239,14 +233,13 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
     record = {name: content.get(name) for name in ("device", "versions", "commit")}
     record["wall_seconds"] = content.get("seconds")
-    _check(content["config"], _CONFIG, "config")
     _check(record, _RECORD, "the file")
     for part in parts.values():
         _check_part(part)
-    config, policy, seed = content["config"], content["policy"], content.get("seed", 0)
-    asked = path, config, _variant(file, path, config), policy, suite
+    config = renames.current(content["config"])
+    fields = path, config, _variant(file, path, config), content["policy"], suite
     return [
-        Evaluation(*asked, name, seed, _per_episode(part) | part, record)
+        Evaluation(*fields, name, content.get("seed", 0), _per_episode(part) | part, record)
         for name, part in parts.items()
     ]
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from csac_jax.evaluation import statistics
 from csac_jax.report import result_tables
-from csac_jax.report.comparison import Curve, ResultReport, Score, seeds_of
+from csac_jax.report.comparison import Curve, ResultReport, Score
 from csac_jax.report.results import METRICS
 from csac_jax.report.variants import label
 
@@ -21,7 +21,6 @@ class StudyRow(NamedTuple):
     task: str
     actions: int
     method: str
-    algo: str
     score: Score
     curve: Curve | None  # of its training, if that was recorded
 
@@ -30,8 +29,8 @@ def rows(report: ResultReport) -> list[StudyRow]:
     """Lists the evaluated methods by task, actions and name."""
     trained = {curve.variant: curve for curve in report.curves}
     learned = [score for score in report.scores if score.policy == "learned"]
-    found = [_row(score, trained.get(score.variant)) for score in learned]
-    return sorted(found, key=lambda row: (row.task, row.actions, row.method))
+    unsorted = (_row(score, trained.get(score.variant)) for score in learned)
+    return sorted(unsorted, key=lambda row: row[:3])
 
 
 def _row(score: Score, curve: Curve | None) -> StudyRow:
@@ -42,7 +41,7 @@ def _row(score: Score, curve: Curve | None) -> StudyRow:
         name = "target" if name == "clear" else f"target, {name}"
     changed = tuple(change for change in score.variant.changed if change[0] not in AXES)
     method = label(dataclasses.replace(score.variant, changed=changed), preset=False)
-    return StudyRow(name, train.get("actions", 0), method, score.variant.algo, score, curve)
+    return StudyRow(name, train.get("actions", 0), method, score, curve)
 
 
 def table(report: ResultReport) -> result_tables.ResultTable:
@@ -51,17 +50,14 @@ def table(report: ResultReport) -> result_tables.ResultTable:
 
 
 def _cells(row: StudyRow) -> dict[str, str]:
-    seeds = {seed for runs in row.score.parts.values() for seed in seeds_of(runs)}
     final = row.curve and statistics.band([row.curve.final])
     area = row.curve and statistics.band([row.curve.area])
     return {
         "task": row.task,
         "actions": f"{row.actions:,}",
         "method": row.method,
-        "seeds": str(len(seeds)),
+        "seeds": str(row.score.seeds),
         f"training: {result_tables.LAST}": result_tables.shown(final),
         f"training: {result_tables.AREA}": result_tables.shown(area),
-    } | {
-        title: result_tables.shown(row.score.band(metric), metric=metric)
-        for metric, title in METRICS.items()
+        **result_tables.metric_cells(row.score),
     }

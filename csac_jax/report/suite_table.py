@@ -7,8 +7,12 @@ from typing import Any
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import result_tables
 
-METRICS = ("grasp_success", "completion", "declutter_rate", "action_efficiency")
-TITLES = ("grasp success", "completion", "objects taken", "objects per action")
+METRICS = {
+    "grasp_success": "grasp success",
+    "completion": "completion",
+    "declutter_rate": "objects taken",
+    "action_efficiency": "objects per action",
+}
 Row = tuple[str, ...]
 
 
@@ -34,6 +38,6 @@ def shown(bands: Iterable[Band | None]) -> list[str]:
 
 def markdown(table: Iterable[Row]) -> str:
     """Writes rows as a Markdown table."""
-    head = ("suite", "policy", "episodes", *TITLES)
-    lines = [f"| {' | '.join(row)} |" for row in (head, ("---",) * len(head), *table)]
-    return "\n".join([*lines, "", "In brackets: 95 % intervals.", ""])
+    head = ("suite", "policy", "episodes", *METRICS.values())
+    named = [dict(zip(head, row, strict=True)) for row in table]
+    return f"{result_tables.table_text(named)}\n\nIn brackets: 95 % intervals.\n"

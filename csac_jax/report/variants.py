@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from csac_jax import algorithms, presets
+from csac_jax.config import Config
 from csac_jax.io import configs
 
 NAMES = {
@@ -18,8 +19,8 @@ NAMES = {
     "csac_per": "CSAC-PER",
     "csac_beta": "CSAC-beta",
 }
-NAMED = ("seed", "preset", "algo", "sim.physics")  # have a place of their own in tables
-HOST = ("format", "train.chunk", "train.save_every")  # settings that no result depends on
+UNNAMED = {"seed", "preset", "algo", "sim.physics"}  # have a place of their own in tables
+UNNAMED |= {"format", "train.chunk", "train.save_every"}  # no result depends on them
 LENGTH = "train."  # settings of a run's length and shape do not make another method
 MOST_CHANGES = 6  # a variant with more is named by its folder
 DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_temperature": 0.0}
@@ -27,7 +28,6 @@ DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_t
 VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")  # likewise
 
 Json = dict[str, Any]
-Changes = tuple[tuple[str, str], ...]  # dotted settings and their values as text
 
 
 @dataclasses.dataclass(frozen=True, order=True)
@@ -36,7 +36,7 @@ class Variant:
 
     preset: str
     algo: str
-    changed: Changes  # settings that differ from the preset's
+    changed: tuple[tuple[str, str], ...]  # dotted settings unlike the preset's, values as text
     source: str = dataclasses.field(default="", compare=False)  # name of the folder or file
 
     @property
@@ -47,17 +47,16 @@ class Variant:
 
 def variant(config: Json) -> Variant:
     """Builds the variant of a recorded config. Missing settings count as the preset's."""
-    preset, algo = config.get("preset", ""), configs.algorithm(config)
-    base: Json = {}
+    preset, algo = config.get("preset", ""), config.get("algo", Config.algo)
+    base, settings = {}, configs.flat(config)
     with contextlib.suppress(ValueError):  # the preset or the algorithm is gone
         base = _preset_settings(preset, algo)
-    settings = configs.flat(config)
     with contextlib.suppress(ValueError):  # written by a version with other settings
         settings = _settings(json.dumps({**config, "seed": 0}))
     changed = tuple(
         (name, _text(value))
         for name, value in settings.items()
-        if value != base.get(name, value) and name not in (*NAMED, *HOST)
+        if value != base.get(name, value) and name not in UNNAMED
     )
     return Variant(preset, algo, changed)
 
@@ -99,17 +98,11 @@ def train_command(config: Json) -> str:
     return f"{command} --sim.physics {physics}{_flags(made.changed)}"
 
 
-def eval_command(policy: str, suite: str, episodes: Any, seed: int, evaluated: Json) -> str:
-    """Returns the command of an evaluation, without `eval_options`."""
+def eval_command(asked: str, evaluated: Json, trained: Json) -> str:
+    """Returns the command of an evaluation: what was `asked`, and where the configs differ."""
     physics, robot = world(evaluated)
-    asked = f"--policy {policy} --suite {suite} --episodes {episodes} --seed {seed}"
-    return f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
-
-
-def eval_options(evaluated: Json, trained: Json) -> str:
-    """Returns the options of `eval` for settings that differ from the trained config's."""
     now, before = ({**DECISION, **configs.flat(one)} for one in (evaluated, trained))
-    options = ""
+    options = f"csac-jax eval RUN {asked} --physics {physics} --robot {robot}"
     if library := now.get("scene.objects"):
         options += "" if library == before.get("scene.objects") else f" --objects {library}"
         split = now.get("scene.split", "")
@@ -118,10 +111,9 @@ def eval_options(evaluated: Json, trained: Json) -> str:
         if (value := now[name]) != before[name]:
             text = {True: "on", False: "off"}[value] if isinstance(value, bool) else value
             options += f" --{name.removeprefix('policy.').replace('_', '-')} {text}"
-    viewed = (name for name in now if name.startswith(VIEW))
-    return options + _flags(
-        (name, _text(now[name])) for name in viewed if now[name] != before.get(name, now[name])
-    )
+    viewed = [name for name in now if name.startswith(VIEW)]
+    changed = [name for name in viewed if now[name] != before.get(name, now[name])]
+    return options + _flags((name, _text(now[name])) for name in changed)
 
 
 def _text(value: Any) -> str:
@@ -129,10 +121,10 @@ def _text(value: Any) -> str:
 
 
 def _flags(settings: Iterable[tuple[str, str]]) -> str:
-    return "".join(f" {_flag(name, value)}" for name, value in settings)
-
-
-def _flag(name: str, value: str) -> str:
-    section, _, field = name.replace("_", "-").rpartition(".")
-    switch = {"True": field, "False": f"no-{field}"}.get(value)
-    return f"--{section}.{switch}" if switch else f"--{section}.{field} {value}"
+    """Writes settings as options; a switch that is off is --SECTION.no-FIELD."""
+    text = ""
+    for name, value in settings:
+        section, _, field = name.replace("_", "-").rpartition(".")
+        switch = {"True": field, "False": f"no-{field}"}.get(value, f"{field} {value}")
+        text += f" --{section}.{switch}"
+    return text
