@@ -8,24 +8,21 @@ import tyro
 
 from csac_jax.cli import parsing, settings
 from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.robot_options import PolicyOptions
 from csac_jax.config import Config
 
 NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra `export`
 
 
-@dataclasses.dataclass(frozen=True)
-class ExportOptions:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportOptions(PolicyOptions):
     """Writes a policy, networks and config, into one file."""
 
-    policy: tyro.conf.Positional[str]
-    """Folder of a run, a policy file, or one that comes with the package, such as shipped."""
     file: tyro.conf.Positional[Path]
     """File to write, which must not exist, such as policy.safetensors."""
     format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"
     """safetensors: a policy file for the other commands. stablehlo: a program that jax runs alone.
     onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
-    gripper: str | None = None
-    """The robot's gripper, by name or folder; by default that of the training."""
     augment: Literal["on", "off"] | None = None
     """Takes the mean of Q over mirror images of the view, see `policy.augment` of `csac-jax train
     --help-all`; by default as the policy's."""
@@ -65,9 +62,8 @@ def run(arguments: list[str]) -> int:
 
 def _check(options: ExportOptions) -> None:
     if options.file.suffix != f".{options.format}":
-        kind = "policy file" if options.format == "safetensors" else "program"
         raise BadArgumentsError(
-            f"{options.file}: the name of a {kind} ends in .{options.format}, see --format"
+            f"{options.file}: the name must end in .{options.format}, see --format"
         )
     if options.file.exists():
         raise BadArgumentsError(f"{options.file} exists; give another name")
@@ -97,7 +93,6 @@ def _mean(params: Any, source: str) -> Any:
 
 
 def _program(options: ExportOptions, cfg: Config, params: Any) -> bytes:
-    """Returns the content of a file that holds a program."""
     import jax
 
     from csac_jax.deploy import stablehlo

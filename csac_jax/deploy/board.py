@@ -55,46 +55,32 @@ class Board:
         size = [round(side * self.square / _INCH * DPI) for side in (COLUMNS, ROWS)]
         margin = round(_MARGIN / _INCH * DPI)
         page = np.pad(self.charuco.generateImage(size), margin, constant_values=255)
-        corner, length = (margin // 2, page.shape[0] - margin // 2), 4 * margin
-        for name, tip in (("x", (length, corner[1])), ("y", (corner[0], corner[1] - length))):
-            cv2.arrowedLine(page, corner, tip, 0, 3, tipLength=0.05)
-            label = (tip[0] + 10, tip[1] + 10) if name == "x" else (tip[0] - 10, tip[1] - 20)
-            cv2.putText(page, name, label, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
+        left, low, length = margin // 2, page.shape[0] - margin // 2, 4 * margin
+        axes = (("x", (length, low), (10, 10)), ("y", (left, low - length), (-10, -20)))
+        for name, tip, label in axes:
+            cv2.arrowedLine(page, (left, low), tip, 0, 3, tipLength=0.05)
+            place = (tip[0] + label[0], tip[1] + label[1])
+            cv2.putText(page, name, place, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
         return page
 
 
 class Located(NamedTuple):
-    """A board's pose before a camera."""
+    """A pose that images of boards give, and its errors."""
 
-    pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward)
-    residual_mm: np.ndarray  # [n] of each corner seen, from where the pose puts it, at the board
-
-
-class HandEye(NamedTuple):
-    """A camera's pose by several poses of the arm. n = poses."""
-
-    pose: np.ndarray  # [4, 4] camera to robot
-    residual_mm: np.ndarray  # [n] the board's middle in the hand, from its mean
+    pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward), or camera to robot
+    residual_mm: np.ndarray  # [n]
 
 
 def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
-    """Finds the board in an image [h, w, 3] uint8.
+    """Finds the pose of the board before the camera in an image [h, w, 3] uint8.
 
-    Raises SettingsError for arrays of a wrong form, FailedError if too little of it is seen.
+    The residual is that of each corner seen, from where the pose puts it, at the board. Raises
+    SettingsError for arrays of a wrong form, FailedError if too little of the board is seen.
     """
     camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
     if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
         raise SettingsError("rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    seen, numbers, *_ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
-    count = 0 if numbers is None else len(numbers)
-    if count < LEAST_CORNERS:
-        raise FailedError(
-            f"{count} of the board's {len(board.corners)} corners are seen, {LEAST_CORNERS} are "
-            "needed; bring it nearer, or give it more light"
-        )
-    seen = seen.reshape(-1, 2).astype(np.float64)
-    corners = board.corners[numbers.reshape(-1)]
+    seen, corners = _corners(board, pixels)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     lens = np.array(camera.distortion or (0.0,) * 5)
     solved, turn, place = cv2.solvePnP(corners, seen, matrix, lens, flags=cv2.SOLVEPNP_IPPE)
@@ -109,16 +95,25 @@ def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
     return Located(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
 
 
-def on_table(board: Located) -> np.ndarray:
-    """Returns the camera's pose [4, 4] in the workspace, whose axes are the board's."""
-    return np.linalg.inv(board.pose)
+def _corners(board: Board, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the corners that are seen: [n, 2] px, and [n, 3] m in the board's axes."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    seen, numbers, *_ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
+    count = 0 if numbers is None else len(numbers)
+    if count < LEAST_CORNERS:
+        raise FailedError(
+            f"{count} of the board's {len(board.corners)} corners are seen, {LEAST_CORNERS} are "
+            "needed; bring it nearer, or give it more light"
+        )
+    return seen.reshape(-1, 2).astype(np.float64), board.corners[numbers.reshape(-1)]
 
 
-def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> HandEye:
+def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> Located:
     """Computes the pose of a fixed camera by a board in the gripper; Park and Martin 1994.
 
-    Args: robot, poses [4, 4] from gripper to robot, one for each image. Raises SettingsError for
-    too few poses, and for poses that differ too little.
+    Args: robot, poses [4, 4] from gripper to robot, one for each image. The residual is that of the
+    board's middle in the hand, from its mean, for each. Raises SettingsError for too few poses, and
+    for poses that differ too little.
     """
     arms = [images.rigid(pose, "robot") for pose in robot]
     if len(arms) != len(boards) or len(arms) < LEAST_POSES:
@@ -126,28 +121,17 @@ def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> HandEye:
             f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
             f"{len(arms)} for {len(boards)}"
         )
-    axes = [_turn(arms[0], arm) for arm in arms[1:]]
+    axes = [cv2.Rodrigues(arms[0][:3, :3].T @ arm[:3, :3])[0].ravel() for arm in arms[1:]]  # rad
     if np.linalg.svd(np.array(axes), compute_uv=False)[1] < LEAST_TURN:
         raise SettingsError(
             "robot: the poses turn about one axis; turn the hand about two, by 30 degrees or more"
         )
-    back = [np.linalg.inv(arm) for arm in arms]  # OpenCV's names are of a camera in the hand
-    pose = np.eye(4)
-    pose[:3, :3], place = cv2.calibrateHandEye(
-        [inverse[:3, :3] for inverse in back],
-        [inverse[:3, 3] for inverse in back],
-        [board.pose[:3, :3] for board in boards],
-        [board.pose[:3, 3] for board in boards],
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
+    hands = np.linalg.inv(arms)  # OpenCV's names are of a camera in the hand
+    seen, pose = np.array([board.pose for board in boards]), np.eye(4)
+    solve: Any = functools.partial(cv2.calibrateHandEye, method=cv2.CALIB_HAND_EYE_PARK)
+    parts = hands[:, :3, :3], hands[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3]
+    pose[:3, :3], place = solve(*parts)
     pose[:3, 3] = place.ravel()
-    middles = np.array(
-        [(arm @ pose @ board.pose)[:3, 3] for arm, board in zip(back, boards, strict=True)]
-    )
+    middles = (hands @ pose @ seen)[:, :3, 3]
     off = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
-    return HandEye(pose, 1e3 * off)
-
-
-def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the rotation vector [3] rad from one pose to another."""
-    return cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0].ravel()
+    return Located(pose, 1e3 * off)

@@ -19,7 +19,7 @@ _LINE = 0.01  # m, least standard deviation of the points across the line throug
 
 
 class Calibration(NamedTuple):
-    """A camera's pose and how well it fits. n = points."""
+    """A camera's pose and its errors. n = points."""
 
     pose: np.ndarray  # [4, 4] camera (x right, y down, z forward) to the frame of what was touched
     residual_mm: np.ndarray  # [n] from each touched point to where the pose puts the seen one
@@ -59,10 +59,8 @@ def fit(seen: Any, touched: Any) -> Calibration:
     """
     seen, touched = _points(seen, 3, "seen"), _points(touched, 3, "touched")
     if len(seen) != len(touched) or len(seen) < LEAST:
-        raise SettingsError(
-            f"touched: give one point for each one seen, {LEAST} or more, not {len(touched)} for "
-            f"{len(seen)}"
-        )
+        counts = f"{LEAST} or more, not {len(touched)} for {len(seen)}"
+        raise SettingsError(f"touched: give one point for each one seen, {counts}")
     from_mean, to_mean = seen - seen.mean(axis=0), touched - touched.mean(axis=0)
     if np.linalg.svd(to_mean, compute_uv=False)[1] < _LINE * len(seen) ** 0.5:
         raise SettingsError("touched: the points lie on a line; choose some off it")
@@ -81,10 +79,7 @@ def fit(seen: Any, touched: Any) -> Calibration:
 
 def _points(values: Any, size: int, name: str) -> np.ndarray:
     """Converts values to an array [n, size]. Raises SettingsError unless all are finite numbers."""
-    try:
-        points = np.array(values, np.float64)
-    except (TypeError, ValueError):
-        points = np.zeros(0)
-    if points.ndim != 2 or points.shape[1] != size or not np.isfinite(points).all():
+    points = images.finite(values)
+    if points.ndim != 2 or points.shape[1] != size:
         raise SettingsError(f"{name}: must be rows of {size} finite numbers")
     return points

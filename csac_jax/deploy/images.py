@@ -6,10 +6,11 @@ is along z. A pose `T_workspace_camera` maps camera to workspace. h, w = rows an
 
 import dataclasses
 import functools
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import pydantic
+import pydantic.dataclasses
 
 from csac_jax.errors import SettingsError, first_fault
 
@@ -27,11 +28,10 @@ _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Positive = Annotated[_Number, pydantic.Field(gt=0.0)]
 
 
-@dataclasses.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config={"extra": "forbid"})
 class Intrinsics:
-    """A pinhole camera, which `of` checks."""
+    """A pinhole camera."""
 
-    __pydantic_config__: ClassVar = {"extra": "forbid", "revalidate_instances": "always"}
     width: _Pixels
     height: _Pixels
     fx: _Positive  # px
@@ -48,9 +48,9 @@ class Intrinsics:
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """Returns checked intrinsics of others, or of a mapping. Raises SettingsError."""
+        """Returns intrinsics, or those of a mapping. Raises SettingsError for bad ones."""
         try:
-            return _adapter().validate_python(values)
+            return pydantic.TypeAdapter(cls).validate_python(values)
         except pydantic.ValidationError as error:
             raise SettingsError(f"intrinsics: {first_fault(error)}") from None
 
@@ -58,11 +58,6 @@ class Intrinsics:
     def shape(self) -> tuple[int, int]:
         """Returns rows and columns of the image."""
         return self.height, self.width
-
-
-@functools.cache
-def _adapter() -> pydantic.TypeAdapter[Intrinsics]:
-    return pydantic.TypeAdapter(Intrinsics)
 
 
 def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
@@ -83,10 +78,8 @@ def rays(intrinsics: Intrinsics) -> np.ndarray:
     Raises SettingsError for a distortion that has no inverse over the image.
     """
     u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
-    distorted = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy], -1
-    )
-    ideal = distorted
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    ideal = distorted = np.stack([x, y], axis=-1)
     if any(intrinsics.distortion):
         with np.errstate(all="ignore"):  # it may diverge
             for _ in range(_ROUNDS):
@@ -97,13 +90,19 @@ def rays(intrinsics: Intrinsics) -> np.ndarray:
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).astype(np.float32)
 
 
+def finite(values: Any) -> np.ndarray:
+    """Converts to float64; returns an empty array unless all are finite numbers."""
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
+    return array if np.isfinite(array).all() else np.empty(0)
+
+
 def rigid(matrix: Any, name: str) -> np.ndarray:
     """Converts a matrix to a pose [4, 4] float64. Raises SettingsError if it is not rigid."""
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
-        raise SettingsError(f"{name}: must be a 4 x 4 matrix of numbers") from None
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+    pose = finite(matrix)
+    if pose.shape != (4, 4):
         raise SettingsError(f"{name}: must be a 4 x 4 matrix of finite numbers")
     rotation = pose[:3, :3]
     square = np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID
@@ -147,19 +146,16 @@ class CameraView:
     @property
     def sparse(self) -> tuple[slice, slice]:
         """Returns rows and columns of some 20,000 pixels all over the image, for measurements."""
-        step = max(1, int(np.sqrt(self.depth.size / 20_000)))
-        return slice(None, None, step), slice(None, None, step)
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects points [n, 3] m of the workspace: column and row [n, 2] px, and [n] bool, True
-        inside the image."""
-        return project(self.intrinsics, self.pose, points)
+        return (slice(None, None, max(1, int(np.sqrt(self.depth.size / 20_000)))),) * 2
 
 
 def project(
     intrinsics: Intrinsics, pose: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Projects points as `CameraView.project`."""
+    """Projects points [n, 3] m of the workspace to a camera at `pose`.
+
+    Returns column and row [n, 2] px, and [n] bool, True inside the image.
+    """
     x, y, depth = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     ahead = depth > 1e-3
     ideal = np.stack([x, y], axis=1) / np.where(ahead, depth, 1.0)[:, None]
@@ -179,16 +175,14 @@ def make(
     camera, pose = Intrinsics.of(intrinsics), rigid(camera_pose, "camera_pose")
     colour, metres = _colour(np.asarray(rgb)), _depth(np.asarray(depth))
     target = None if target_mask is None else _mask(np.asarray(target_mask))
-    arrays = {"rgb": colour, "depth": metres, "target_mask": target}
+    arrays = {"rgb": colour, "depth": metres, "target_mask": target, "intrinsics": camera}
     sizes = {name: array.shape[:2] for name, array in arrays.items() if array is not None}
-    if set(sizes.values()) != {camera.shape}:
+    if len(set(sizes.values())) > 1:
         shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
-        wanted = f"{camera.width} x {camera.height}"
-        raise SettingsError(f"{shown}, intrinsics {wanted}: align them to one camera and one size")
+        raise SettingsError(f"{shown}: align them to one camera and one size")
     valid = np.isfinite(metres) & (metres > 0.0)
-    return CameraView(
-        colour, np.where(valid, metres, 0.0).astype(np.float32), valid, target, camera, pose
-    )
+    metres = np.where(valid, metres, 0.0).astype(np.float32)
+    return CameraView(colour, metres, valid, target, camera, pose)
 
 
 def _colour(rgb: np.ndarray) -> np.ndarray:
@@ -205,10 +199,8 @@ def _depth(depth: np.ndarray) -> np.ndarray:
     if depth.ndim != 2:
         raise SettingsError(f"depth: must have shape [rows, columns], not {list(depth.shape)}")
     if depth.dtype.kind != "f":
-        raise SettingsError(
-            f"depth: is {depth.dtype}, which has no unit; give metres as float: "
-            "depth * 0.001 for millimetres"
-        )
+        remedy = "give metres as float: depth * 0.001 for millimetres"
+        raise SettingsError(f"depth: is {depth.dtype}, which has no unit; {remedy}")
     return depth
 
 
