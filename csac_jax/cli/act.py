@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
+from csac_jax.cli.failures import as_bad_arguments
 from csac_jax.cli.robot_options import RobotOptions
 from csac_jax.errors import FailedError
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -37,8 +38,8 @@ class ActOptions(RobotOptions):
 def run(arguments: list[str]) -> int:
     """Decides and prints; returns the exit code."""
     options = parsing.parse(ActOptions, arguments, "act")
-    if options.check and options.record is not None:
-        raise BadArgumentsError("--record: --check decides nothing; leave one of them out")
+    both = options.check and options.record is not None
+    require(not both, "--record: --check decides nothing; leave one of them out")
     if options.png is not None:
         from csac_jax.render import media
 
@@ -57,8 +58,8 @@ def run(arguments: list[str]) -> int:
 
 
 def _decide(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
-    from csac_jax.deploy import image_files
-    from csac_jax.render import decision_picture
+    from csac_jax.deploy import image_files, images
+    from csac_jax.render import decision_picture, media
 
     mask = None if options.mask is None else image_files.read_mask(options.mask)
     recorder = options.recorder()
@@ -68,21 +69,15 @@ def _decide(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
     if not decisions:
         print("nothing to act on")
     if options.png is not None:
-        _draw(options.png, policy, (*image, mask), decisions)
+        view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
+        drawing = decision_picture.picture(policy.cfg, view, decisions, maps)
+        media.write_picture(options.png, drawing)
     result: dict[str, Any] = {"decisions": [action.to_dict() for action in decisions]}
     if recorder is not None:
         result["id"] = recorder.add((*image, mask), decisions)
         print(f"recorded as {options.record / result['id']}")
     output.write_result(options.json, result, policy.cfg)
     return 0
-
-
-def _draw(path: Path, policy: Any, image: tuple[Any, ...], decisions: list[Any]) -> None:
-    from csac_jax.deploy import images
-    from csac_jax.render import decision_picture, media
-
-    view, maps = images.make(*image), policy.maps(*image)
-    media.write_picture(path, decision_picture.picture(policy.cfg, view, decisions, maps))
 
 
 def _check(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
@@ -94,8 +89,7 @@ def _check(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
     print(f"noise      {report.noise_mm:.1f} mm, of points on the table")
     print(f"seen       {report.seen:.0%} of the workspace")
     print(f"covered    {report.covered_cm2:.0f} cm^2 are higher than 1 cm")
-    result = {**report._asdict(), "faults": report.faults}
-    output.write_result(options.json, result, policy.cfg)
+    output.write_result(options.json, {**vars(report), "faults": report.faults}, policy.cfg)
     if report.faults:
         raise FailedError("; ".join(report.faults))
     print("pose and intrinsics fit")

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +40,12 @@ def run(arguments: list[str]) -> int:
     if options.board is not None:
         return _print(options.board, options.square)
     if not options.rgb or options.intrinsics is None:
-        raise BadArgumentsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
-    if bool(options.robot) != (options.workspace is not None):
-        raise BadArgumentsError("calibrate: --robot and --workspace go together")
-    if not options.robot and len(options.rgb) > 1:
-        raise BadArgumentsError("--rgb: one image of a board on the table, or give --robot too")
+        raise SettingsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
+    in_hand = bool(options.robot)
+    together = in_hand == (options.workspace is not None)
+    require(together, "calibrate: --robot and --workspace go together")
+    single = in_hand or len(options.rgb) == 1
+    require(single, "--rgb: one image of a board on the table, or give --robot too")
     return _locate(options, options.intrinsics)
 
 
@@ -50,8 +53,7 @@ def _print(path: Path, square: float) -> int:
     from csac_jax.deploy import board, image_files
     from csac_jax.io import files
 
-    if path.suffix != ".png":
-        raise BadArgumentsError(f"--board: {path} must end in .png")
+    require(path.suffix == ".png", f"--board: {path} must end in .png")
     files.replace(path, image_files.encode(board.Board(square).picture(), board.DPI))
     wide, high = (1e3 * side * square for side in (board.COLUMNS, board.ROWS))
     print(

@@ -9,9 +9,11 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import BadArgumentsError, check_seed
+from csac_jax.cli.failures import check_seed
 from csac_jax.cli.robot_options import PolicyOptions
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
+from csac_jax.section import require
 
 INTERVAL = 10.0  # s between lines
 
@@ -45,9 +47,8 @@ def run(arguments: list[str]) -> int:
     try:
         from csac_jax.deploy import CameraPolicy, fine_tuning
     except ModuleNotFoundError as error:
-        raise BadArgumentsError(
-            f"finetune needs {error.name}; copy the record to a machine where it is installed"
-        ) from None
+        remedy = "copy the record to a machine where it is installed"
+        raise SettingsError(f"finetune needs {error.name}; {remedy}") from None
     from csac_jax.io import policy_file
 
     policy = CameraPolicy.load(options.policy, gripper=options.gripper)
@@ -67,17 +68,13 @@ def run(arguments: list[str]) -> int:
 
 
 def _check(options: FinetuneOptions) -> None:
-    if options.out.suffix != ".safetensors":
-        raise BadArgumentsError(f"--out: {options.out} must end in .safetensors")
-    if options.out.exists():
-        raise BadArgumentsError(f"--out: {options.out} exists; give another name")
-    if options.updates < 1:
-        raise BadArgumentsError("--updates: at least 1")
+    out = options.out
+    require(out.suffix == ".safetensors", f"--out: {out} must end in .safetensors")
+    require(not out.exists(), f"--out: {out} exists; give another name")
+    require(options.updates >= 1, "--updates: at least 1")
     check_seed(options.seed)
-    if not 1 <= options.batch <= 4096:
-        raise BadArgumentsError("--batch: must lie in 1 .. 4096")
-    if not 0.0 < options.learning_rate < 1.0:
-        raise BadArgumentsError("--learning-rate: must lie between 0 and 1")
+    require(1 <= options.batch <= 4096, "--batch: must lie in 1 .. 4096")
+    require(0.0 < options.learning_rate < 1.0, "--learning-rate: must lie between 0 and 1")
 
 
 def _printer() -> Callable[[int, int, float, float], None]:

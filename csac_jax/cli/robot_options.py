@@ -6,6 +6,8 @@ from typing import Any
 
 import tyro
 
+from csac_jax.section import require
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PolicyOptions:
@@ -38,3 +40,9 @@ class RobotOptions(PolicyOptions):
         from csac_jax.deploy.record import Recorder
 
         return None if self.record is None else Recorder(self.record, self.policy)
+
+
+def check_size(size: tuple[int, int]) -> None:
+    """Raises SettingsError for a bad size of images, px."""
+    fits = all(16 <= side <= 4096 for side in size)
+    require(fits, "--size: both numbers must lie in 16 .. 4096 px")

@@ -4,8 +4,9 @@ import dataclasses
 from pathlib import Path
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
-from csac_jax.cli.robot_options import RobotOptions
+from csac_jax.cli.failures import check_extra
+from csac_jax.cli.robot_options import RobotOptions, check_size
+from csac_jax.section import require
 
 LOCAL = ("127.0.0.1", "::1", "localhost")
 SHORTEST_TOKEN = 16  # characters
@@ -32,10 +33,8 @@ def run(arguments: list[str]) -> int:
     for module in ("fastapi", "uvicorn"):
         check_extra("serve", module, "serve")
     token = _token(options)
-    if not 0 <= options.port < 2**16:
-        raise BadArgumentsError("--port: must lie in 0 .. 65535")
-    if not all(16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+    require(0 <= options.port < 2**16, "--port: must lie in 0 .. 65535")
+    check_size(options.size)
     import uvicorn
 
     from csac_jax.deploy import service
@@ -48,17 +47,14 @@ def run(arguments: list[str]) -> int:
 
 
 def _token(options: ServeOptions) -> str | None:
-    if options.token_file is None:
-        if options.host not in LOCAL:
-            raise BadArgumentsError(
-                f"--host {options.host}: others could use the service; give --token-file too"
-            )
+    file, host = options.token_file, options.host
+    if file is None:
+        fault = f"--host {host}: others could use the service; give --token-file too"
+        require(host in LOCAL, fault)
         return None
-    if not options.token_file.is_file():
-        raise BadArgumentsError(f"--token-file: there is no file {options.token_file}")
-    token = options.token_file.read_text().split("\n")[0].strip()
-    if len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable():
-        raise BadArgumentsError(
-            f"--token-file: its first line must have {SHORTEST_TOKEN} printable characters or more"
-        )
+    require(file.is_file(), f"--token-file: there is no file {file}")
+    token = file.read_text(errors="replace").split("\n")[0].strip()
+    fits = len(token) >= SHORTEST_TOKEN and token.isascii() and token.isprintable()
+    needed = f"{SHORTEST_TOKEN} printable characters or more"
+    require(fits, f"--token-file: its first line must have {needed}")
     return token

@@ -132,7 +132,7 @@ class CameraPolicy:
         height = np.asarray(_observe(self.cfg, *_pixels(view)).height)
         seen = checks.seen(view, self.cfg.heightmap)[1].mean()
         covered = np.sum(height > BARE) * 1e4 * self.cfg.heightmap.cell**2
-        return CameraReport(*table, seen=float(seen), covered_cm2=float(covered))
+        return CameraReport(**vars(table), seen=float(seen), covered_cm2=float(covered))
 
     def warm_up(self, width: int, height: int) -> None:
         """Compiles decisions about images of this size, px."""

@@ -8,13 +8,15 @@ to the right of the page, y up the page, z out of it.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 
 from csac_jax.deploy import images
-from csac_jax.errors import FailedError, SettingsError
+from csac_jax.deploy.calibration import Calibration
+from csac_jax.errors import FailedError
+from csac_jax.section import require
 
 COLUMNS, ROWS = 8, 6  # squares of the board; with 30 mm they fit A4
 DPI = 300  # of the printed picture
@@ -33,8 +35,7 @@ class Board:
     square: float = 0.03  # m, side of a square: measure it
 
     def __post_init__(self) -> None:
-        if not 0.003 <= self.square <= 0.3:
-            raise SettingsError("square: the side of a square in m, 0.003 to 0.3")
+        require(0.003 <= self.square <= 0.3, "square: the side of a square in m, 0.003 to 0.3")
 
     @functools.cached_property
     def charuco(self) -> Any:
@@ -64,22 +65,15 @@ class Board:
         return page
 
 
-class Located(NamedTuple):
-    """A pose that images of boards give, and its errors."""
-
-    pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward), or camera to robot
-    residual_mm: np.ndarray  # [n]
-
-
-def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
-    """Finds the pose of the board before the camera in an image [h, w, 3] uint8.
+def locate(board: Board, rgb: Any, intrinsics: Any) -> Calibration:
+    """Finds the pose of the board, board to camera, in an image [h, w, 3] uint8.
 
     The residual is that of each corner seen, from where the pose puts it, at the board. Raises
     SettingsError for arrays of a wrong form, FailedError if too little of the board is seen.
     """
     camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
-    if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
-        raise SettingsError("rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
+    fits = pixels.shape == (*camera.shape, 3) and pixels.dtype == np.uint8
+    require(fits, "rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
     seen, corners = _corners(board, pixels)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     lens = np.array(camera.distortion or (0.0,) * 5)
@@ -92,7 +86,7 @@ def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
     again = cv2.projectPoints(corners, turn, place, matrix, lens)[0].reshape(-1, 2)
     depth = corners @ pose[2, :3] + pose[2, 3]
     off = (again - seen) / [camera.fx, camera.fy]
-    return Located(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
+    return Calibration(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
 
 
 def _corners(board: Board, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,24 +102,21 @@ def _corners(board: Board, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return seen.reshape(-1, 2).astype(np.float64), board.corners[numbers.reshape(-1)]
 
 
-def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> Located:
-    """Computes the pose of a fixed camera by a board in the gripper; Park and Martin 1994.
+def hand_eye(boards: Sequence[Calibration], robot: Sequence[Any]) -> Calibration:
+    """Computes a fixed camera's pose in the robot's frame by a board in the gripper.
 
-    Args: robot, poses [4, 4] from gripper to robot, one for each image. The residual is that of the
-    board's middle in the hand, from its mean, for each. Raises SettingsError for too few poses, and
-    for poses that differ too little.
+    Park and Martin 1994. Args: robot, for each image the pose [4, 4] from gripper to robot. The
+    residual is the board's middle in the hand, from its mean. Raises SettingsError for too few
+    poses, and for poses that differ too little.
     """
     arms = [images.rigid(pose, "robot") for pose in robot]
-    if len(arms) != len(boards) or len(arms) < LEAST_POSES:
-        raise SettingsError(
-            f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
-            f"{len(arms)} for {len(boards)}"
-        )
+    counts = f"{LEAST_POSES} or more, not {len(arms)} for {len(boards)}"
+    enough = len(arms) == len(boards) and len(arms) >= LEAST_POSES
+    require(enough, f"robot: give a pose of the arm for each image, {counts}")
     axes = [cv2.Rodrigues(arms[0][:3, :3].T @ arm[:3, :3])[0].ravel() for arm in arms[1:]]  # rad
-    if np.linalg.svd(np.array(axes), compute_uv=False)[1] < LEAST_TURN:
-        raise SettingsError(
-            "robot: the poses turn about one axis; turn the hand about two, by 30 degrees or more"
-        )
+    turned = np.linalg.svd(np.array(axes), compute_uv=False)[1] >= LEAST_TURN
+    remedy = "turn the hand about two, by 30 degrees or more"
+    require(turned, f"robot: the poses turn about one axis; {remedy}")
     hands = np.linalg.inv(arms)  # OpenCV's names are of a camera in the hand
     seen, pose = np.array([board.pose for board in boards]), np.eye(4)
     solve: Any = functools.partial(cv2.calibrateHandEye, method=cv2.CALIB_HAND_EYE_PARK)
@@ -134,4 +125,4 @@ def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> Located:
     pose[:3, 3] = place.ravel()
     middles = (hands @ pose @ seen)[:, :3, 3]
     off = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
-    return Located(pose, 1e3 * off)
+    return Calibration(pose, 1e3 * off)

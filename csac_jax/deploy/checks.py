@@ -3,8 +3,8 @@
 They raise ViewError, one line that says what is wrong by how much.
 """
 
+import dataclasses
 import warnings
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -30,7 +30,8 @@ _AROUND = 1.25  # side of the square in which the table is looked for, of the wo
 _UNITS = {3: "millimetres", 2: "centimetres"}  # power of ten of measured over expected depth
 
 
-class Table(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Table:
     """The table under and around the workspace, by an image."""
 
     height_mm: float  # above z = 0, at the workspace's centre
@@ -39,13 +40,10 @@ class Table(NamedTuple):
     noise_mm: float  # standard deviation of the points on it
 
 
-class CameraReport(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class CameraReport(Table):
     """Measurements in an image of the empty table, which show if pose and intrinsics fit."""
 
-    height_mm: float  # these four as in `Table`
-    tilt_deg: float
-    worst_mm: float
-    noise_mm: float
     seen: float  # share of the workspace
     covered_cm2: float  # area higher than 1 cm, which an empty table has none of
 
@@ -64,7 +62,13 @@ def fits(view: CameraView, cfg: HeightmapConfig) -> None:
     """Runs all checks."""
     pose(view)
     depth_unit(view, cfg.extent)
-    _table_height(table(view, cfg.extent))
+    plane = table(view, cfg.extent)
+    if plane.worst_mm > 1e3 * TABLE_TOLERANCE:
+        raise ViewError(
+            f"the table lies {plane.height_mm:+.0f} mm from z = 0, tilted by {plane.tilt_deg:.1f} "
+            f"degrees: {plane.worst_mm:.0f} mm at a corner of the workspace, "
+            f"{1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
+        )
     _coverage(view, cfg)
     colours(view, cfg.extent)
 
@@ -74,15 +78,14 @@ def pose(view: CameraView) -> None:
     pose, far = view.pose, np.linalg.norm(view.pose[:3, 3])
     if np.abs(pose[:3, 3]).max() > HIGHEST_POSE:
         raise ViewError(f"camera_pose: the camera is {far:.0f} m away; its unit is m")
-    hints = {
-        "": pose,
-        "it seems to map workspace to camera; give its inverse": np.linalg.inv(pose),
-        "its axes seem to be OpenGL's; turn y and z round": pose @ np.diag([1.0, -1.0, -1.0, 1.0]),
-    }
-    unknown = "check it, x right, y down, z forward"
-    hint = next((hint for hint, pose in hints.items() if _sees_centre(view, pose)), unknown)
-    if hint:
-        raise ViewError(f"camera_pose: the workspace's centre is not in the image; {hint}")
+    if _sees_centre(view, pose):
+        return
+    hint = "check it, x right, y down, z forward"
+    if _sees_centre(view, np.linalg.inv(pose)):
+        hint = "it seems to map workspace to camera; give its inverse"
+    elif _sees_centre(view, pose @ np.diag([1.0, -1.0, -1.0, 1.0])):
+        hint = "its axes seem to be OpenGL's; turn y and z round"
+    raise ViewError(f"camera_pose: the workspace's centre is not in the image; {hint}")
 
 
 def _sees_centre(view: CameraView, pose: np.ndarray) -> bool:
@@ -154,15 +157,6 @@ def _largest_plane(points: np.ndarray) -> tuple[list[float], float] | None:
             return None
         plane = np.linalg.lstsq(basis[on], points[on, 2])[0]
     return plane.tolist(), float(np.std(points[on, 2] - basis[on] @ plane))
-
-
-def _table_height(table: Table) -> None:
-    if table.worst_mm > 1e3 * TABLE_TOLERANCE:
-        raise ViewError(
-            f"the table lies {table.height_mm:+.0f} mm from z = 0, tilted by {table.tilt_deg:.1f} "
-            f"degrees: {table.worst_mm:.0f} mm at a corner of the workspace, "
-            f"{1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
-        )
 
 
 def _cells(cfg: HeightmapConfig) -> tuple[np.ndarray, ...]:

@@ -13,9 +13,9 @@ from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
-from csac_jax.errors import SettingsError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
+from csac_jax.section import require
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 
@@ -32,10 +32,9 @@ class Choice(NamedTuple):
 
 
 def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> Observation:
-    """Projects an image's pixels to the view from above. Leaves out points above VIEW_HEIGHT.
+    """Projects points [n, 3] m of the workspace below VIEW_HEIGHT to the view from above.
 
-    Args: points [n, 3] m, workspace frame; valid [n] bool; colour [n, 3] uint8; target [n] bool, or
-    None if any object will do.
+    Args: valid [n] bool; colour [n, 3] uint8; target [n] bool, or None if any object will do.
     """
     cells = heightmap.from_points(cfg.heightmap, points, valid & (points[:, 2] < VIEW_HEIGHT))
     seen = colour.at[cells.source].get(mode="promise_in_bounds").astype(jnp.float32) / 255.0
@@ -52,9 +51,9 @@ def fingers(cfg: Config) -> jax.Array | None:
     Raises SettingsError for a gripper that varies: a robot has one.
     """
     gripper = grippers.load(cfg.sim.gripper)
-    if gripper.varies is not None:
-        known = ", ".join(grippers.shipped())
-        raise SettingsError(f"gripper: name the robot's, one of {known}, or its folder")
+    known = ", ".join(grippers.shipped())
+    fault = f"gripper: name the robot's, one of {known}, or its folder"
+    require(gripper.varies is None, fault)
     return jnp.array(gripper.fingers, jnp.float32) if cfg.net.gripper else None
 
 

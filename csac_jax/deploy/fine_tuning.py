@@ -1,7 +1,5 @@
 """A policy learns from a record of its own actions, see `record`; no scene is simulated.
 
-    policy, summary = fine_tuning.run(CameraPolicy.load("shipped"), Path("record"))
-
 It learns from the height maps that were decided on. The learner's modules need MuJoCo installed.
 n = transitions.
 """
@@ -89,14 +87,10 @@ def run(
     rewarded = transitions(policy, program.learner, learner, recorded)
     state = OfflineState(key, jnp.int32(0), learner, offline.fill(program, rewarded))
     state, errors, seconds = _learn(program, state, on_progress, stop)
-    summary = FineTuningSummary(
-        actions=len(recorded.outcome),
-        lifted=int((recorded.outcome == Outcome.LIFTED).sum()),
-        updates=len(errors) * UPDATES,
-        td_error=(errors[0], errors[-1]) if errors else (0.0, 0.0),
-        seconds=seconds,
-        stopped_by=stop.signal,
-    )
+    lifted = int((recorded.outcome == Outcome.LIFTED).sum())
+    ends = (errors[0], errors[-1]) if errors else (0.0, 0.0)
+    updates, num = len(errors) * UPDATES, len(recorded.outcome)
+    summary = FineTuningSummary(num, lifted, updates, ends, seconds, stop.signal)
     return dataclasses.replace(policy, params=state.learner.online), summary
 
 
@@ -105,13 +99,9 @@ def configure(cfg: Config, settings: Settings, num: int) -> Config:
 
     They are drawn uniformly: ranks by error would repeat the few whose outcome was luck.
     """
-    learn = {
-        "learning_rate": settings.learning_rate,
-        "actor_learning_rate": settings.learning_rate / 3.0,
-        "batch": settings.batch,
-        "actor_batch": 0,
-        "updates_per_step": UPDATES,
-    }
+    learn: dict[str, Any] = {"batch": settings.batch, "actor_batch": 0, "updates_per_step": UPDATES}
+    learn["learning_rate"] = settings.learning_rate
+    learn["actor_learning_rate"] = settings.learning_rate / 3.0
     steps = -(-settings.updates // UPDATES)
     train = {"scenes": 1, "actions": steps, "learning_starts": settings.batch}
     small = cfg.change(learn=learn, train=train)
@@ -152,10 +142,8 @@ def load(policy: CameraPolicy, entries: list[Entry]) -> Experience:
         after = observed(number if ended else number + 1)
         rows.append(Experience(observed(number), *_done(entry), after, np.bool_(ended)))
     if not rows:
-        raise SettingsError(
-            "the record has no action with an outcome and an image after it; post outcomes, "
-            "see docs/robot.md"
-        )
+        needed = "an action with an outcome and an image after it"
+        raise SettingsError(f"the record lacks {needed}; post outcomes, see docs/robot.md")
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
 
@@ -194,19 +182,13 @@ def transitions(
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _rewarded(cfg: Config, learner: Learner, state: Any, part: Experience) -> Transition:
-    """Computes the rewards of a part; lost blocks and distances are unknown and cost 0."""
+    """Computes the rewards; lost blocks, distances and values of states are unknown, cost 0."""
     unknown = jnp.zeros(part.outcome.shape)
     obs, after = heightmap.unpack(part.obs), heightmap.unpack(part.next_obs)
     moved = jax.vmap(heightmap.moved_area, (None, 0, 0))(cfg.heightmap, obs.height, after.height)
-    result = ActionResult(
-        primitive=part.action.primitive,
-        outcome=part.outcome,
-        distance=unknown,
-        phi_before=unknown,
-        phi_after=unknown,
-        changed=moved > CHANGE_AREA,
-        blocks_lost=unknown.astype(jnp.int32),
-    )
+    done = part.action.primitive, part.outcome
+    changed, lost = moved > CHANGE_AREA, jnp.zeros(part.outcome.shape, jnp.int32)
+    result = ActionResult(*done, unknown, unknown, unknown, changed, lost)
     reward, better = learner.reward(cfg.reward, state, obs, after, result)
     end = part.terminated
     if cfg.target.bootstrap == "continuing":  # nothing follows an action without any effect

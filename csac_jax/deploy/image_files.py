@@ -13,6 +13,7 @@ from csac_jax.deploy import images
 from csac_jax.deploy.images import Intrinsics
 from csac_jax.errors import SettingsError, first_fault
 from csac_jax.io import files
+from csac_jax.section import require
 
 
 class PoseBody(pydantic.BaseModel, extra="forbid"):
@@ -31,16 +32,15 @@ def read_depth(path: Path) -> np.ndarray:
     if path.suffix != ".npy":
         return _read(path, lambda content: metres(decode(content)))
     depth: np.ndarray = _read(path, _array)
-    if depth.dtype.kind != "f":
-        raise SettingsError(f"{path}: is {depth.dtype}; an .npy file holds metres as float32")
+    fault = f"{path}: is {depth.dtype}; an .npy file holds metres as float32"
+    require(depth.dtype.kind == "f", fault)
     return depth
 
 
 def read_mask(path: Path) -> np.ndarray:
     """Reads a mask [h, w] bool, True where an image or an .npy is not 0."""
     mask: np.ndarray = _read(path, _array if path.suffix == ".npy" else decode)
-    if mask.ndim != 2:
-        raise SettingsError(f"{path}: a mask has one channel, not shape {list(mask.shape)}")
+    require(mask.ndim == 2, f"{path}: a mask has one channel, not shape {list(mask.shape)}")
     return mask != 0
 
 
@@ -61,8 +61,8 @@ def read_json(path: Path, kind: Any) -> Any:
 
 def metres(depth: np.ndarray) -> np.ndarray:
     """Converts depth of an image of 16 bits, in mm, to float32 m."""
-    if depth.dtype.itemsize < 2 or depth.dtype.kind not in "iu":
-        raise SettingsError(f"depth: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
+    fits = depth.dtype.itemsize >= 2 and depth.dtype.kind in "iu"
+    require(fits, f"depth: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
     return (1e-3 * depth).astype(np.float32)
 
 

@@ -13,6 +13,7 @@ import pydantic
 import pydantic.dataclasses
 
 from csac_jax.errors import SettingsError, first_fault
+from csac_jax.section import require
 
 MOST_PIXELS = 4096  # of a side
 _ROUNDS = 20  # of the iteration that removes distortion, as in OpenCV's undistortPoints
@@ -85,8 +86,8 @@ def rays(intrinsics: Intrinsics) -> np.ndarray:
             for _ in range(_ROUNDS):
                 ideal = ideal + distorted - distort(intrinsics, ideal)
             error = np.abs(distort(intrinsics, ideal) - distorted).max() * intrinsics.fx
-        if not error < 0.1:
-            raise SettingsError("intrinsics.distortion: has no inverse over the image; rectify it")
+        fault = "intrinsics.distortion: has no inverse over the image; rectify it"
+        require(bool(error < 0.1), fault)
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).astype(np.float32)
 
 
@@ -102,15 +103,12 @@ def finite(values: Any) -> np.ndarray:
 def rigid(matrix: Any, name: str) -> np.ndarray:
     """Converts a matrix to a pose [4, 4] float64. Raises SettingsError if it is not rigid."""
     pose = finite(matrix)
-    if pose.shape != (4, 4):
-        raise SettingsError(f"{name}: must be a 4 x 4 matrix of finite numbers")
+    require(pose.shape == (4, 4), f"{name}: must be a 4 x 4 matrix of finite numbers")
     rotation = pose[:3, :3]
     square = np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID
-    if not square or np.linalg.det(rotation) < 0.0 or np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
-        raise SettingsError(
-            f"{name}: must be a rotation and a translation in m, last row 0 0 0 1; it may be "
-            "transposed, scaled or mirrored"
-        )
+    is_rigid = square and np.linalg.det(rotation) >= 0.0 and np.all(pose[3] == [0, 0, 0, 1])
+    form = "a rotation and a translation in m, last row 0 0 0 1"
+    require(bool(is_rigid), f"{name}: must be {form}; it may be transposed, scaled or mirrored")
     return pose
 
 
@@ -177,36 +175,30 @@ def make(
     target = None if target_mask is None else _mask(np.asarray(target_mask))
     arrays = {"rgb": colour, "depth": metres, "target_mask": target, "intrinsics": camera}
     sizes = {name: array.shape[:2] for name, array in arrays.items() if array is not None}
-    if len(set(sizes.values())) > 1:
-        shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
-        raise SettingsError(f"{shown}: align them to one camera and one size")
+    shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
+    require(len(set(sizes.values())) == 1, f"{shown}: align them to one camera and one size")
     valid = np.isfinite(metres) & (metres > 0.0)
     metres = np.where(valid, metres, 0.0).astype(np.float32)
     return CameraView(colour, metres, valid, target, camera, pose)
 
 
 def _colour(rgb: np.ndarray) -> np.ndarray:
-    if rgb.ndim != 3 or rgb.shape[2] != 3:
-        hint = "; leave out its alpha: rgb[..., :3]" if rgb.ndim == 3 and rgb.shape[2] == 4 else ""
-        raise SettingsError(f"rgb: must have shape [rows, columns, 3], not {list(rgb.shape)}{hint}")
-    if rgb.dtype != np.uint8:
-        scale = "rgb * 255 as uint8" if rgb.dtype.kind == "f" else "values 0 to 255 as uint8"
-        raise SettingsError(f"rgb: is {rgb.dtype}; give {scale}, red first")
+    hint = "; leave out its alpha: rgb[..., :3]" if rgb.shape[2:] == (4,) else ""
+    shape = f"rgb: must have shape [rows, columns, 3], not {list(rgb.shape)}{hint}"
+    require(rgb.shape[2:] == (3,), shape)
+    require(rgb.dtype == np.uint8, f"rgb: is {rgb.dtype}; give 0 to 255 as uint8, red first")
     return rgb
 
 
 def _depth(depth: np.ndarray) -> np.ndarray:
-    if depth.ndim != 2:
-        raise SettingsError(f"depth: must have shape [rows, columns], not {list(depth.shape)}")
-    if depth.dtype.kind != "f":
-        remedy = "give metres as float: depth * 0.001 for millimetres"
-        raise SettingsError(f"depth: is {depth.dtype}, which has no unit; {remedy}")
+    require(depth.ndim == 2, f"depth: must have shape [rows, columns], not {list(depth.shape)}")
+    remedy = "give metres as float: depth * 0.001 for millimetres"
+    require(depth.dtype.kind == "f", f"depth: is {depth.dtype}, which has no unit; {remedy}")
     return depth
 
 
 def _mask(mask: np.ndarray) -> np.ndarray:
-    if mask.ndim != 2 or mask.dtype.kind not in "bu":
-        raise SettingsError("target_mask: must be bool or whole numbers [rows, columns]")
-    if not mask.any():
-        raise SettingsError("target_mask: marks no pixel; mark the object, or leave the mask out")
+    fits = mask.ndim == 2 and mask.dtype.kind in "bu"
+    require(fits, "target_mask: must be bool or whole numbers [rows, columns]")
+    require(bool(mask.any()), "target_mask: marks no pixel; mark the object, or leave the mask out")
     return mask != 0

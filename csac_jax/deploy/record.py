@@ -26,6 +26,7 @@ from csac_jax.deploy import image_files, images
 from csac_jax.deploy.decision import Decision
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
+from csac_jax.section import require
 
 FORMAT = 1
 PUSHED = "pushed"  # the outcome of every push: its effect is seen in the next image
@@ -46,12 +47,12 @@ class ReportedOutcome(pydantic.BaseModel, extra="forbid", strict=True, frozen=Tr
 
     def check(self, decisions: Sequence[dict[str, Any]]) -> None:
         """Raises SettingsError if it is no outcome of these decisions."""
-        if self.number > len(decisions):
-            raise SettingsError(f"number: there are {len(decisions)} decisions, not {self.number}")
-        pushed = decisions[self.number - 1]["primitive"] == "push"
-        if pushed != (self.outcome == PUSHED):
-            primitive, names = ("push", PUSHED) if pushed else ("grasp", ", ".join(OUTCOMES))
-            raise SettingsError(f"outcome: of a {primitive} it is {names}, not {self.outcome}")
+        num = len(decisions)
+        require(self.number <= num, f"number: there are {num} decisions, not {self.number}")
+        primitive = decisions[self.number - 1]["primitive"]
+        outcomes = (PUSHED,) if primitive == "push" else OUTCOMES
+        fault = f"outcome: of a {primitive} it is {', '.join(outcomes)}, not {self.outcome}"
+        require(self.outcome in outcomes, fault)
 
 
 class _StoredDecision(pydantic.BaseModel, extra="allow", strict=True):
@@ -107,10 +108,10 @@ class Recorder:
 
     def add(self, image: Image, decisions: Sequence[Decision]) -> str:
         """Stores an image and its decisions; returns the entry's name. Raises OSError."""
-        draft = Path(tempfile.mkdtemp(prefix=".", dir=self._folder))
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         listed = [decision.to_dict() for decision in decisions]
         content = {"time": now, "policy": self._policy, "decisions": listed}
+        draft = Path(tempfile.mkdtemp(prefix=".", dir=self._folder))
         try:
             _write(draft, image)
             files.write_json(draft / _DECISION, content)
@@ -138,12 +139,11 @@ def is_name(name: str) -> bool:
 
 def _check(folder: Path) -> None:
     """Raises SettingsError for a folder that is no record, or is of another format."""
-    if not (folder / _HEAD).is_file():
-        raise SettingsError(f"{folder} is no record: it has no {_HEAD}; give another folder")
+    fault = f"{folder} is no record: it has no {_HEAD}; give another folder"
+    require((folder / _HEAD).is_file(), fault)
     number = image_files.read_json(folder / _HEAD, dict[str, Any]).get("format")
-    if number != FORMAT:
-        known = f"this version reads {FORMAT}; update csac-jax"
-        raise SettingsError(f"{folder}: format {number!r:.20} is unknown, {known}")
+    known = f"this version reads {FORMAT}; update csac-jax"
+    require(number == FORMAT, f"{folder}: format {number!r:.20} is unknown, {known}")
 
 
 def read(folder: Path) -> list[Entry]:

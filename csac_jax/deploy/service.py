@@ -13,7 +13,6 @@ Decisions are taken one by one, and requests wait for their turn.
 
 import asyncio
 import base64
-import binascii
 import functools
 import secrets
 import struct
@@ -34,6 +33,7 @@ from csac_jax.deploy.image_files import PoseBody
 from csac_jax.deploy.record import Image, Recorder, ReportedOutcome
 from csac_jax.errors import DataWarning, SettingsError, ViewError, first_fault
 from csac_jax.runtime import provenance
+from csac_jax.section import require
 
 LARGEST_BODY = 16 * 2**20  # bytes: two images of 1280 x 720 px take a third
 MOST_DISCARDED = 8 * LARGEST_BODY
@@ -46,7 +46,8 @@ STATUS: dict[type[Exception], int] = {
     pydantic.ValidationError: 422,
     OSError: 507,
 }
-_PNG = struct.Struct(">8s4x4sII")  # signature, first chunk, width, height
+_PNG, _PNG_START = struct.Struct(">16sII"), b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+"""The start of a PNG: signature, length and name of the first chunk; then width and height."""
 
 
 class DecideRequest(pydantic.BaseModel, extra="forbid"):
@@ -167,11 +168,10 @@ def _pixels(text: str, name: str) -> np.ndarray:
     """Decodes a PNG in base64. Raises SettingsError for anything else, and for one too large."""
     try:
         content = base64.b64decode(text, validate=True)
-        signature, kind, width, height = _PNG.unpack_from(content)
-    except (binascii.Error, ValueError, struct.error):
-        raise SettingsError(f"{name}: must be a PNG in base64") from None
-    if signature != b"\x89PNG\r\n\x1a\n" or kind != b"IHDR":
-        raise SettingsError(f"{name}: must be a PNG in base64")
-    if max(width, height) > images.MOST_PIXELS:
-        raise SettingsError(f"{name}: at most {images.MOST_PIXELS} px a side")
+        start, width, height = _PNG.unpack_from(content)
+    except (ValueError, struct.error):
+        start, width, height = b"", 0, 0
+    require(start == _PNG_START, f"{name}: must be a PNG in base64")
+    fits = max(width, height) <= images.MOST_PIXELS
+    require(fits, f"{name}: at most {images.MOST_PIXELS} px a side")
     return image_files.decode(content)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax import cli
 from csac_jax.deploy import images
+from csac_jax.deploy.calibration import Calibration
 from csac_jax.errors import FailedError, SettingsError
 from tests.deploy import boards, scenes
 
@@ -81,7 +82,7 @@ def test_hand_eye_residual_is_the_arms_error():
     """Claim: exact poses give the camera to 1e-6 and no residual; with 2 mm of error at the arm
     the residual is between 1 and 4 mm."""
     arms, rng = _arm(1, 12), np.random.default_rng(2)
-    located = [board.Located(_seen_by_camera(arm), np.zeros(35)) for arm in arms]
+    located = [Calibration(_seen_by_camera(arm), np.zeros(35)) for arm in arms]
     exact = board.hand_eye(located, arms)
     np.testing.assert_allclose(exact.pose, CAMERA, atol=1e-6)
     assert exact.residual_mm.max() < 1e-3
@@ -99,7 +100,7 @@ def test_too_little_is_refused():
         board.locate(BOARD, image, boards.LENS)
     with pytest.raises(SettingsError, match="of the intrinsics' size"):
         board.locate(BOARD, image[::2], boards.LENS)
-    located = [board.Located(np.eye(4), np.zeros(35))] * 4
+    located = [Calibration(np.eye(4), np.zeros(35))] * 4
     turned = [_rigid(Rotation.from_euler("z", 30 * i, degrees=True), [0, 0, 0]) for i in range(4)]
     with pytest.raises(SettingsError, match="the poses turn about one axis"):
         board.hand_eye(located, turned)
@@ -155,22 +156,3 @@ def test_command_in_the_hand(
     residuals = re.findall(r"json: (\S+) mm off", capsys.readouterr().out)
     assert len(residuals) == 5
     assert max(map(float, residuals)) < 2.0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "calibrate: give --rgb and --intrinsics, or --board FILE to print"),
-        ("--board board.pdf", "--board: board.pdf must end in .png"),
-        ("--rgb a.png b.png --intrinsics c.json", "--rgb: one image of a board on the table"),
-        ("--rgb a.png --intrinsics c.json --robot d.json", "--robot and --workspace go together"),
-        ("--rgb a.png --intrinsics c.json", "there is no file c.json"),
-        ("--rgb a.png --intrinsics c.json --square 30", "the side of a square in m"),
-    ],
-)
-def test_bad_options(capsys: pytest.CaptureFixture, arguments: str, message: str):
-    """Claim: what cannot be calibrated from is refused with exit code 2 and one line."""
-    assert cli.main(["calibrate", *arguments.split()]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1

@@ -179,9 +179,8 @@ def test_command_writes_a_policy(
     overwrites nothing."""
     start, out = tmp_path / "start.safetensors", tmp_path / "new.safetensors"
     policy_file.save(start, policy.params, policy.cfg)
-    options = "--updates 100 --batch 8 --learning-rate 1e-2 --json".split()
-    files = ["--out", str(out), *options, str(tmp_path / "done.json")]
-    arguments = ["finetune", str(start), str(lesson), *files]
+    arguments = ["finetune", str(start), str(lesson), "--out", str(out), "--updates=100"]
+    arguments += ["--batch=8", "--learning-rate=1e-2", "--json", str(tmp_path / "done.json")]
     assert cli.main(arguments) == 0
     printed = capsys.readouterr().out
     assert "100 of 100 updates, TD error" in printed
@@ -197,10 +196,17 @@ def test_command_writes_a_policy(
 @pytest.mark.parametrize(
     ("file", "change", "message"),
     [
-        ("*/outcome.json", None, "the record has no action with an outcome and an image after it"),
-        ("000002/rgb.png", lambda file: file[:200], r"000002/rgb\.png: "),
+        (
+            "*/outcome.json",
+            None,
+            "the record lacks an action with an outcome and an image after it",
+        ),
         ("000001/depth.npy", None, r"there is no file .*000001/depth\.npy"),
-        ("*/intrinsics.json", lambda file: file.replace(b"160", b"320"), "000001: rgb 160 x 120"),
+        (
+            "000001/intrinsics.json",
+            lambda file: file.replace(b"160", b"320"),
+            "000001: rgb 160 x 120",
+        ),
     ],
 )
 def test_bad_records_are_refused(
@@ -224,28 +230,6 @@ def test_loss_that_is_not_finite(policy: CameraPolicy, lesson: Path):
     broken = dataclasses.replace(policy, params=jax.tree.map(lambda x: x * np.nan, policy.params))
     with pytest.raises(FailedError, match=r"not finite after 10 updates; lower learning_rate"):
         fine_tuning.run(broken, lesson, SETTINGS)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("--out new.bin", "--out: new.bin must end in .safetensors"),
-        ("--updates 0", "--updates: "),
-        ("--batch 0", "--batch: "),
-        ("--learning-rate 0", "--learning-rate: "),
-        ("--seed -1", "--seed: "),
-        ("", "nowhere is no record: it has no record.json"),
-    ],
-)
-def test_bad_options(
-    capsys: pytest.CaptureFixture, monkeypatch: Any, tmp_path: Path, options: str, message: str
-):
-    """Claim: what cannot be learned is refused with exit code 2 and one line."""
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["finetune", "shipped", "nowhere", *options.split()]) == 2
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
 
 
 def test_without_mujoco_it_is_one_line(tmp_path: Path):

@@ -69,7 +69,7 @@ def test_missing_depth_is_missing():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rgb": RGB / 255.0}, "rgb: is float64; give rgb * 255 as uint8"),
+        ({"rgb": RGB / 255.0}, "rgb: is float64; give 0 to 255 as uint8"),
         ({"rgb": np.zeros((48, 64, 4), np.uint8)}, "leave out its alpha: rgb[..., :3]"),
         ({"depth": (1000 * DEPTH).astype(np.uint16)}, "depth * 0.001 for millimetres"),
         ({"depth": DEPTH[..., None]}, "depth: must have shape [rows, columns], not [48, 64, 1]"),

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from csac_jax.cli import main
 from csac_jax.deploy import CameraPolicy, record
+from csac_jax.deploy.image_files import encode
 from csac_jax.deploy.record import Recorder
 from tests.deploy import image_files, scenes
 
@@ -35,11 +35,11 @@ def _base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
-PNG = image_files.png(IMAGE.rgb)
+PNG = encode(IMAGE.rgb)
 HUGE = PNG[:16] + (60000).to_bytes(4, "big") * 2 + PNG[24:]  # px, by its header
 BODY: dict[str, Any] = {
     "rgb": _base64(PNG),
-    "depth": _base64(image_files.png(np.round(1000 * IMAGE.depth).astype(np.uint16))),
+    "depth": _base64(encode(np.round(1000 * IMAGE.depth).astype(np.uint16))),
     "intrinsics": IMAGE.intrinsics,
     "pose": {"matrix": IMAGE.pose.tolist()},
 }
@@ -49,9 +49,8 @@ class Server:
     """A service in a thread."""
 
     def __init__(self, app: Any) -> None:
-        self._server = uvicorn.Server(
-            uvicorn.Config(app, port=0, log_level="error", lifespan="off")
-        )
+        config = uvicorn.Config(app, port=0, log_level="error", lifespan="off")
+        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
         while not self._server.started:
@@ -102,7 +101,7 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
     mask = np.zeros((480, 640), np.uint8)
     mask[:, 320:] = 255
     _, first = recording.ask("POST", "/decide", {**BODY, "top": 2})
-    marked = {**BODY, "mask": _base64(image_files.png(mask))}
+    marked = {**BODY, "mask": _base64(encode(mask))}
     _, second = recording.ask("POST", "/decide", marked)
     assert [first["id"], second["id"]] == ["000001", "000002"]
     assert second["decisions"][0]["position"][1] < -0.03  # the block at y = -0.09
@@ -165,7 +164,7 @@ def test_decides_as_the_library(server: Server, policy: CameraPolicy):
     status, answer = server.ask("POST", "/outcome", {"id": "000001", "outcome": "lifted"})
     assert status == 404
     assert "the service records nothing" in answer["detail"]
-    swapped = {**BODY, "rgb": _base64(image_files.png(IMAGE.rgb[..., ::-1]))}
+    swapped = {**BODY, "rgb": _base64(encode(IMAGE.rgb[..., ::-1]))}
     _, answer = server.ask("POST", "/decide", swapped)
     assert "red and blue seem to be swapped" in answer["warnings"][0]
 
@@ -245,23 +244,3 @@ def test_many_clients_lose_nothing(server: Server):
         answers = [future.result() for future in asked]
     assert [status for status, _ in answers] == [200] * CLIENTS
     assert [len(answer["decisions"]) for _, answer in answers] == tops
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--host 0.0.0.0", "give --token-file too"),
-        ("--token-file nowhere", "--token-file: there is no file nowhere"),
-        ("--token-file short", "its first line must have 16 printable characters or more"),
-        ("--port 70000", "--port: "),
-        ("--size 8 8", "--size: "),
-    ],
-)
-def test_bad_options_of_serve(
-    capsys: pytest.CaptureFixture, tmp_path: Any, monkeypatch: Any, arguments: str, message: str
-):
-    """Claim: what cannot be served, or not safely, is refused with exit code 2."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "short").write_text("secret\n")
-    assert main(["serve", "shipped", *arguments.split()]) == 2
-    assert message in capsys.readouterr().err
