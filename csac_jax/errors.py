@@ -2,8 +2,8 @@
 
 from typing import Any
 
-_REASONS = {"missing": "is missing", "extra_forbidden": "is unknown"}
-_REASONS["unexpected_keyword_argument"] = _REASONS["extra_forbidden"]
+_UNKNOWN = dict.fromkeys(("extra_forbidden", "unexpected_keyword_argument"), "is unknown")
+_REASONS = {"missing": "is missing", **_UNKNOWN}
 
 
 class SettingsError(ValueError):

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,25 +37,44 @@ def run(arguments: list[str]) -> int:
     """Writes the board or the pose; returns the exit code."""
     options = parsing.parse(CalibrateOptions, arguments, "calibrate")
     check_extra("calibrate", "cv2", "calibrate")
-    from csac_jax.deploy import board
-
-    printed = board.Board(options.square)
     if options.board is not None:
-        return _print(options.board, printed)
-    _check(options)
-    import numpy as np
+        return _print(options.board, options.square)
+    if not options.rgb or options.intrinsics is None:
+        raise SettingsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
+    in_hand = bool(options.robot)
+    together = in_hand == (options.workspace is not None)
+    require(together, "calibrate: --robot and --workspace go together")
+    single = in_hand or len(options.rgb) == 1
+    require(single, "--rgb: one image of a board on the table, or give --robot too")
+    return _locate(options, options.intrinsics)
 
-    from csac_jax.deploy import image_files
+
+def _print(path: Path, square: float) -> int:
+    from csac_jax.deploy import board, image_files
     from csac_jax.io import files
 
-    assert options.intrinsics is not None
-    lens = image_files.read_intrinsics(options.intrinsics)
+    require(path.suffix == ".png", f"--board: {path} must end in .png")
+    files.replace(path, image_files.encode(board.Board(square).picture(), board.DPI))
+    wide, high = (1e3 * side * square for side in (board.COLUMNS, board.ROWS))
+    print(
+        f"wrote {path}: a board of {wide:.0f} x {high:.0f} mm at {board.DPI} dpi; print it in its "
+        "own size, measure a square, and give that to --square"
+    )
+    return 0
+
+
+def _locate(options: CalibrateOptions, intrinsics: Path) -> int:
+    import numpy as np
+
+    from csac_jax.deploy import board, image_files
+    from csac_jax.io import files
+
+    printed, lens = board.Board(options.square), image_files.read_intrinsics(intrinsics)
     boards = [board.locate(printed, image_files.read_rgb(path), lens) for path in options.rgb]
     for path, located in zip(options.rgb, boards, strict=True):
         print(f"{path}: {len(located.residual_mm)} corners, {_spread(located.residual_mm)}")
-    if options.workspace is None:
-        pose = board.on_table(boards[0])
-    else:
+    pose = np.linalg.inv(boards[0].pose)  # of one on the table, whose axes are the workspace's
+    if options.workspace is not None:
         workspace = image_files.read_pose(options.workspace)
         eye = board.hand_eye(boards, [image_files.read_pose(path) for path in options.robot])
         for path, off in zip(options.robot, eye.residual_mm, strict=True):
@@ -62,30 +83,6 @@ def run(arguments: list[str]) -> int:
         pose = np.linalg.inv(workspace) @ eye.pose
     files.write_json(options.out, {"matrix": pose.tolist()})
     print(f"wrote {options.out}")
-    return 0
-
-
-def _check(options: CalibrateOptions) -> None:
-    if not options.rgb or options.intrinsics is None:
-        raise BadArgumentsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
-    if bool(options.robot) != (options.workspace is not None):
-        raise BadArgumentsError("calibrate: --robot and --workspace go together")
-    if not options.robot and len(options.rgb) > 1:
-        raise BadArgumentsError("--rgb: one image of a board on the table, or give --robot too")
-
-
-def _print(path: Path, printed: Any) -> int:
-    from csac_jax.deploy import board, image_files
-    from csac_jax.io import files
-
-    if path.suffix != ".png":
-        raise BadArgumentsError(f"--board: {path} must end in .png")
-    files.replace(path, image_files.encode(printed.picture(), board.DPI))
-    wide, high = (1e3 * side * printed.square for side in (board.COLUMNS, board.ROWS))
-    print(
-        f"wrote {path}: a board of {wide:.0f} x {high:.0f} mm at {board.DPI} dpi; print it in its "
-        "own size, measure a square, and give that to --square"
-    )
     return 0
 
 

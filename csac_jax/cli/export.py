@@ -7,25 +7,24 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax.cli import parsing, settings
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.cli.robot_options import PolicyOptions, check_size
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra `export`
 
 
-@dataclasses.dataclass(frozen=True)
-class ExportOptions:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportOptions(PolicyOptions):
     """Writes a policy, networks and config, into one file."""
 
-    policy: tyro.conf.Positional[str]
-    """Folder of a run, a policy file, or one that comes with the package, such as shipped."""
     file: tyro.conf.Positional[Path]
     """File to write, which must not exist, such as policy.safetensors."""
     format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"
     """safetensors: a policy file for the other commands. stablehlo: a program that jax runs alone.
     onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
-    gripper: str | None = None
-    """The robot's gripper, by name or folder; by default that of the training."""
     augment: Literal["on", "off"] | None = None
     """Takes the mean of Q over mirror images of the view, see `policy.augment` of `csac-jax train
     --help-all`; by default as the policy's."""
@@ -52,8 +51,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.io import files, policy_file
 
     policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
-    with as_bad_arguments(ValueError):
-        cfg = policy.cfg.change(policy=settings.decision(options))
+    cfg = policy.cfg.change(policy=settings.decision(options))
     params = policy.params if options.average is None else _mean(policy.params, options.average)
     if options.format == "safetensors":
         policy_file.save(options.file, params, cfg)
@@ -64,17 +62,12 @@ def run(arguments: list[str]) -> int:
 
 
 def _check(options: ExportOptions) -> None:
-    if options.file.suffix != f".{options.format}":
-        kind = "policy file" if options.format == "safetensors" else "program"
-        raise BadArgumentsError(
-            f"{options.file}: the name of a {kind} ends in .{options.format}, see --format"
-        )
-    if options.file.exists():
-        raise BadArgumentsError(f"{options.file} exists; give another name")
-    if options.input == "image" and options.format != "stablehlo":
-        raise BadArgumentsError("--input image: needs --format stablehlo")
-    if not all(16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+    file, suffix = options.file, f".{options.format}"
+    require(file.suffix == suffix, f"{file}: the name must end in {suffix}, see --format")
+    require(not file.exists(), f"{file} exists; give another name")
+    fits = options.input == "maps" or options.format == "stablehlo"
+    require(fits, "--input image: needs --format stablehlo")
+    check_size(options.size)
     if options.format in NEEDS:
         check_extra(f"--format {options.format}", NEEDS[options.format], "export")
 
@@ -89,15 +82,12 @@ def _mean(params: Any, source: str) -> Any:
     other = deploy.CameraPolicy.load(source).params
     if difference := leaves.difference(leaves.layout(other), leaves.layout(params)):
         name, has, asked = difference
-        raise BadArgumentsError(
-            f"--average {source}: has {name} as {has}, the first policy as {asked}; "
-            "give policies with the same networks"
-        )
+        fault = f"--average {source}: has {name} as {has}, the first policy as {asked}"
+        raise SettingsError(f"{fault}; give policies with the same networks")
     return jax.tree.map(lambda a, b: 0.5 * (a + b), params, other)
 
 
 def _program(options: ExportOptions, cfg: Config, params: Any) -> bytes:
-    """Returns the content of a file that holds a program."""
     import jax
 
     from csac_jax.deploy import stablehlo

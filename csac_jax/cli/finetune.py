@@ -5,28 +5,26 @@ import datetime
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import tyro
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import BadArgumentsError, check_seed
+from csac_jax.cli.failures import check_seed
+from csac_jax.cli.robot_options import PolicyOptions
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
+from csac_jax.section import require
 
 INTERVAL = 10.0  # s between lines
 
 
-@dataclasses.dataclass(frozen=True)
-class FinetuneOptions:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FinetuneOptions(PolicyOptions):
     """Trains a policy further with the actions and outcomes that act or serve recorded. Nothing is
     simulated."""
 
-    policy: tyro.conf.Positional[str]
-    """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     record: tyro.conf.Positional[Path]
     """Folder that act or serve wrote with --record."""
-    gripper: str | None = None
-    """The robot's gripper, by name or folder; by default that of the training."""
     out: Path = Path("finetuned.safetensors")
     """Policy file to write, which must not exist."""
     updates: int = 150
@@ -49,14 +47,13 @@ def run(arguments: list[str]) -> int:
     try:
         from csac_jax.deploy import CameraPolicy, fine_tuning
     except ModuleNotFoundError as error:
-        raise BadArgumentsError(
-            f"finetune needs {error.name}; copy the record to a machine where it is installed"
-        ) from None
+        remedy = "copy the record to a machine where it is installed"
+        raise SettingsError(f"finetune needs {error.name}; {remedy}") from None
     from csac_jax.io import policy_file
 
     policy = CameraPolicy.load(options.policy, gripper=options.gripper)
-    values = (options.updates, options.learning_rate, options.batch, options.seed)
-    settings = fine_tuning.Settings(*values)
+    names = fine_tuning.Settings._fields
+    settings = fine_tuning.Settings(*(getattr(options, name) for name in names))
     tuned, summary = fine_tuning.run(policy, options.record, settings, _printer(), stop)
     policy_file.save(options.out, tuned.params, tuned.cfg)
     print(
@@ -71,34 +68,25 @@ def run(arguments: list[str]) -> int:
 
 
 def _check(options: FinetuneOptions) -> None:
-    if options.out.suffix != ".safetensors":
-        raise BadArgumentsError(f"--out: {options.out} must end in .safetensors")
-    if options.out.exists():
-        raise BadArgumentsError(f"--out: {options.out} exists; give another name")
-    if options.updates < 1:
-        raise BadArgumentsError("--updates: at least 1")
+    out = options.out
+    require(out.suffix == ".safetensors", f"--out: {out} must end in .safetensors")
+    require(not out.exists(), f"--out: {out} exists; give another name")
+    require(options.updates >= 1, "--updates: at least 1")
     check_seed(options.seed)
-    if not 1 <= options.batch <= 4096:
-        raise BadArgumentsError("--batch: must lie in 1 .. 4096")
-    if not 0.0 < options.learning_rate < 1.0:
-        raise BadArgumentsError("--learning-rate: must lie between 0 and 1")
+    require(1 <= options.batch <= 4096, "--batch: must lie in 1 .. 4096")
+    require(0.0 < options.learning_rate < 1.0, "--learning-rate: must lie between 0 and 1")
 
 
-def _printer() -> Callable[[Any], None]:
+def _printer() -> Callable[[int, int, float, float], None]:
     """Returns a callback that prints the progress, at first and then every INTERVAL."""
-    printed = [-INTERVAL]
+    printed = -INTERVAL
 
-    def show(progress: Any) -> None:
-        if time.monotonic() - printed[0] < INTERVAL and progress.updates < progress.total:
-            return
-        printed[0] = time.monotonic()
-        left = datetime.timedelta(
-            seconds=round(progress.seconds * (progress.total / progress.updates - 1.0))
-        )
-        print(
-            f"{progress.updates} of {progress.total} updates, "
-            f"TD error {progress.td_error:.3f}, {left} left",
-            flush=True,
-        )
+    def show(updates: int, total: int, td_error: float, seconds: float) -> None:
+        nonlocal printed
+        if time.monotonic() - printed >= INTERVAL or updates == total:
+            printed = time.monotonic()
+            left = datetime.timedelta(seconds=round(seconds * (total / updates - 1.0)))
+            text = f"{updates} of {total} updates, TD error {td_error:.3f}, {left} left"
+            print(text, flush=True)
 
     return show

@@ -3,34 +3,26 @@
 import dataclasses
 from pathlib import Path
 
-import tyro
-
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.cli.robot_options import RobotOptions, check_size
+from csac_jax.section import require
 
 LOCAL = ("127.0.0.1", "::1", "localhost")
 SHORTEST_TOKEN = 16  # characters
 
 
-@dataclasses.dataclass(frozen=True)
-class ServeOptions:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ServeOptions(RobotOptions):
     """Answers images by decisions over HTTP: POST /decide, POST /outcome, GET /health, GET
     /version."""
 
-    policy: tyro.conf.Positional[str]
-    """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
     host: str = "127.0.0.1"
     """Address to listen on; any but 127.0.0.1 needs --token-file."""
     token_file: Path | None = None
     """File whose first line clients must send as the header Authorization: Bearer LINE."""
-    workspace: Path | None = None
-    """JSON with the 4 x 4 matrix from workspace to robot, for the waypoints' tool poses."""
-    record: Path | None = None
-    """Folder of one robot that stores images, decisions and posted outcomes, for finetune."""
-    gripper: str | None = None
-    """The robot's gripper, by name or folder; by default that of the training."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the images, px, to compile for at the start; others compile later."""
 
@@ -40,38 +32,29 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(ServeOptions, arguments, "serve")
     for module in ("fastapi", "uvicorn"):
         check_extra("serve", module, "serve")
-    token = read_token(options)
-    if not 0 <= options.port < 2**16:
-        raise BadArgumentsError("--port: must lie in 0 .. 65535")
-    if not all(16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+    token = _token(options)
+    require(0 <= options.port < 2**16, "--port: must lie in 0 .. 65535")
+    check_size(options.size)
     import uvicorn
 
-    from csac_jax import deploy
-    from csac_jax.deploy import image_files, record, service
+    from csac_jax.deploy import service
 
-    workspace = None if options.workspace is None else image_files.read_pose(options.workspace)
-    policy = deploy.CameraPolicy.load(options.policy, workspace, options.gripper)
-    recorder = None if options.record is None else record.Recorder(options.record, options.policy)
+    policy, recorder = options.load(), options.recorder()
     policy.warm_up(*options.size)
     app = service.make(policy, options.policy, token, recorder)
     uvicorn.run(app, host=options.host, port=options.port, log_level="warning", lifespan="off")
     return 0
 
 
-def read_token(options: ServeOptions) -> str | None:
-    """Returns the token that clients must send, or None. Raises BadArgumentsError."""
-    if options.token_file is None:
-        if options.host not in LOCAL:
-            raise BadArgumentsError(
-                f"--host {options.host}: others could use the service; give --token-file too"
-            )
+def _token(options: ServeOptions) -> str | None:
+    file, host = options.token_file, options.host
+    if file is None:
+        fault = f"--host {host}: others could use the service; give --token-file too"
+        require(host in LOCAL, fault)
         return None
-    if not options.token_file.is_file():
-        raise BadArgumentsError(f"--token-file: there is no file {options.token_file}")
-    token = options.token_file.read_text().split("\n")[0].strip()
-    if len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable():
-        raise BadArgumentsError(
-            f"--token-file: its first line must have {SHORTEST_TOKEN} printable characters or more"
-        )
+    require(file.is_file(), f"--token-file: there is no file {file}")
+    token = file.read_text(errors="replace").split("\n")[0].strip()
+    fits = len(token) >= SHORTEST_TOKEN and token.isascii() and token.isprintable()
+    needed = f"{SHORTEST_TOKEN} printable characters or more"
+    require(fits, f"--token-file: its first line must have {needed}")
     return token

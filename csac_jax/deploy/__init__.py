@@ -67,10 +67,8 @@ class CameraPolicy:
         path = policy_file.find(source)
         pose = np.eye(4) if workspace_pose is None else images.rigid(workspace_pose, "workspace")
         cfg, params = policy_file.load(path) if path.is_file() else _load_run(path)
-        cfg = cfg.change(
-            sim={"gripper": grippers.resolve(cfg.sim.gripper if gripper is None else gripper)}
-        )
-        return cls(cfg, jax.device_put(params), pose)
+        chosen = grippers.resolve(cfg.sim.gripper if gripper is None else gripper)
+        return cls(cfg.change(sim={"gripper": chosen}), jax.device_put(params), pose)
 
     def decide(
         self,
@@ -91,7 +89,7 @@ class CameraPolicy:
         """
         if not 1 <= top <= MOST_ALTERNATIVES:
             raise SettingsError(f"top: must lie in 1 .. {MOST_ALTERNATIVES}, not {top}")
-        obs, state = self._checked_maps(rgb, depth, intrinsics, camera_pose, target_mask)
+        obs, state = self._maps(rgb, depth, intrinsics, camera_pose, target_mask)
         decisions: list[Decision] = []
         for _ in range(top):
             choice, state = _choose(self.cfg, state, obs.height)
@@ -104,14 +102,22 @@ class CameraPolicy:
         self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
     ) -> Maps:
         """Returns the maps that decisions about this image follow from."""
-        obs, state = self._checked_maps(rgb, depth, intrinsics, camera_pose, target_mask)
+        obs, state = self._maps(rgb, depth, intrinsics, camera_pose, target_mask)
         return Maps(np.asarray(obs.height), np.asarray(_best_over_yaws(self.cfg, state)))
+
+    def _maps(self, *image: Any) -> tuple[Observation, DenseMaps]:
+        cache.enable()
+        obs = self.observe(*image)
+        return obs, _dense_maps(self.cfg, self.params, obs, image[-1] is not None)
 
     def observe(
         self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
     ) -> Observation:
         """Returns the view from above that decisions about this image follow from."""
-        view = self._checked_view(rgb, depth, intrinsics, camera_pose, target_mask)
+        view = images.make(rgb, depth, intrinsics, camera_pose, target_mask)
+        if view.target is None and self.cfg.task.kind == "target":
+            raise SettingsError("target_mask: this policy gets a marked object; mark one")
+        checks.fits(view, self.cfg.heightmap)
         return _observe(self.cfg, *_pixels(view))
 
     def check(self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any) -> CameraReport:
@@ -119,20 +125,14 @@ class CameraPolicy:
 
         Raises as `decide`, but a table away from z = 0 is measured.
         """
-        view = images.make(rgb, depth, intrinsics, camera_pose)
+        view, extent = images.make(rgb, depth, intrinsics, camera_pose), self.cfg.heightmap.extent
         checks.pose(view)
-        checks.depth_unit(view, self.cfg.heightmap.extent)
-        table = checks.table(view, self.cfg.heightmap.extent)
-        _, has_depth = checks.seen(view, self.cfg.heightmap)
+        checks.depth_unit(view, extent)
+        table = checks.table(view, extent)
         height = np.asarray(_observe(self.cfg, *_pixels(view)).height)
-        return CameraReport(
-            height_mm=1e3 * table.height,
-            tilt_deg=table.tilt_deg,
-            worst_mm=1e3 * table.worst(self.cfg.heightmap.extent),
-            noise_mm=1e3 * table.noise,
-            seen=float(has_depth.mean()),
-            covered_cm2=float(np.sum(height > BARE) * 1e4 * self.cfg.heightmap.cell**2),
-        )
+        seen = checks.seen(view, self.cfg.heightmap)[1].mean()
+        covered = np.sum(height > BARE) * 1e4 * self.cfg.heightmap.cell**2
+        return CameraReport(**vars(table), seen=float(seen), covered_cm2=float(covered))
 
     def warm_up(self, width: int, height: int) -> None:
         """Compiles decisions about images of this size, px."""
@@ -145,38 +145,15 @@ class CameraPolicy:
         state = _dense_maps(self.cfg, self.params, obs, target is not None)
         jax.block_until_ready(_choose(self.cfg, state, jax.numpy.zeros(rows)))
 
-    def _checked_maps(self, *image: Any) -> tuple[Observation, DenseMaps]:
-        """Returns the observation and the dense maps of an image, once it is checked."""
-        cache.enable()
-        obs, has_mask = self.observe(*image), image[-1] is not None
-        return obs, _dense_maps(self.cfg, self.params, obs, has_mask)
-
-    def _checked_view(self, *image: Any) -> CameraView:
-        """Makes the view of an image and checks it."""
-        view, extent = images.make(*image), self.cfg.heightmap.extent
-        if view.target is None and self.cfg.task.kind == "target":
-            raise SettingsError("target_mask: this policy gets a marked object; mark one")
-        checks.pose(view)
-        checks.depth_unit(view, extent)
-        checks.table_height(checks.table(view, extent), extent)
-        checks.coverage(view, self.cfg.heightmap)
-        checks.colours(view, extent)
-        return view
-
 
 def _pixels(view: CameraView) -> tuple[Any, ...]:
-    """Returns a view's points, validity, colours and target flags, as `observe` takes them.
-
-    Flying pixels, as depth cameras have them at edges, are not valid.
-    """
+    """Returns points, validity without flying pixels at edges, colours and target flags."""
     target = None if view.target is None else view.target.reshape(-1)
     valid = _supported(view.depth, view.intrinsics.fx).reshape(-1)
-    flat = view.points.reshape(-1, 3), valid, view.colour.reshape(-1, 3), target
-    return jax.device_put(flat)
+    return jax.device_put((view.points.reshape(-1, 3), valid, view.colour.reshape(-1, 3), target))
 
 
 def _load_run(path: Path) -> tuple[Config, Params]:
-    """Loads config and networks of a run's newest sound checkpoint."""
     try:
         from csac_jax.evaluation import policies
     except ModuleNotFoundError as error:

@@ -8,13 +8,15 @@ to the right of the page, y up the page, z out of it.
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 
 from csac_jax.deploy import images
-from csac_jax.errors import FailedError, SettingsError
+from csac_jax.deploy.calibration import Calibration
+from csac_jax.errors import FailedError
+from csac_jax.section import require
 
 COLUMNS, ROWS = 8, 6  # squares of the board; with 30 mm they fit A4
 DPI = 300  # of the printed picture
@@ -33,8 +35,7 @@ class Board:
     square: float = 0.03  # m, side of a square: measure it
 
     def __post_init__(self) -> None:
-        if not 0.003 <= self.square <= 0.3:
-            raise SettingsError("square: the side of a square in m, 0.003 to 0.3")
+        require(0.003 <= self.square <= 0.3, "square: the side of a square in m, 0.003 to 0.3")
 
     @functools.cached_property
     def charuco(self) -> Any:
@@ -55,46 +56,25 @@ class Board:
         size = [round(side * self.square / _INCH * DPI) for side in (COLUMNS, ROWS)]
         margin = round(_MARGIN / _INCH * DPI)
         page = np.pad(self.charuco.generateImage(size), margin, constant_values=255)
-        corner, length = (margin // 2, page.shape[0] - margin // 2), 4 * margin
-        for name, tip in (("x", (length, corner[1])), ("y", (corner[0], corner[1] - length))):
-            cv2.arrowedLine(page, corner, tip, 0, 3, tipLength=0.05)
-            label = (tip[0] + 10, tip[1] + 10) if name == "x" else (tip[0] - 10, tip[1] - 20)
-            cv2.putText(page, name, label, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
+        left, low, length = margin // 2, page.shape[0] - margin // 2, 4 * margin
+        axes = (("x", (length, low), (10, 10)), ("y", (left, low - length), (-10, -20)))
+        for name, tip, label in axes:
+            cv2.arrowedLine(page, (left, low), tip, 0, 3, tipLength=0.05)
+            place = (tip[0] + label[0], tip[1] + label[1])
+            cv2.putText(page, name, place, cv2.FONT_HERSHEY_SIMPLEX, 1.2, 0, 3)
         return page
 
 
-class Located(NamedTuple):
-    """A board's pose before a camera."""
+def locate(board: Board, rgb: Any, intrinsics: Any) -> Calibration:
+    """Finds the pose of the board, board to camera, in an image [h, w, 3] uint8.
 
-    pose: np.ndarray  # [4, 4] board to camera (x right, y down, z forward)
-    residual_mm: np.ndarray  # [n] of each corner seen, from where the pose puts it, at the board
-
-
-class HandEye(NamedTuple):
-    """A camera's pose by several poses of the arm. n = poses."""
-
-    pose: np.ndarray  # [4, 4] camera to robot
-    residual_mm: np.ndarray  # [n] the board's middle in the hand, from its mean
-
-
-def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
-    """Finds the board in an image [h, w, 3] uint8.
-
-    Raises SettingsError for arrays of a wrong form, FailedError if too little of it is seen.
+    The residual is that of each corner seen, from where the pose puts it, at the board. Raises
+    SettingsError for arrays of a wrong form, FailedError if too little of the board is seen.
     """
     camera, pixels = images.Intrinsics.of(intrinsics), np.asarray(rgb)
-    if pixels.shape != (*camera.shape, 3) or pixels.dtype != np.uint8:
-        raise SettingsError("rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
-    seen, numbers, *_ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
-    count = 0 if numbers is None else len(numbers)
-    if count < LEAST_CORNERS:
-        raise FailedError(
-            f"{count} of the board's {len(board.corners)} corners are seen, {LEAST_CORNERS} are "
-            "needed; bring it nearer, or give it more light"
-        )
-    seen = seen.reshape(-1, 2).astype(np.float64)
-    corners = board.corners[numbers.reshape(-1)]
+    fits = pixels.shape == (*camera.shape, 3) and pixels.dtype == np.uint8
+    require(fits, "rgb: must be uint8 [rows, columns, 3] of the intrinsics' size")
+    seen, corners = _corners(board, pixels)
     matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     lens = np.array(camera.distortion or (0.0,) * 5)
     solved, turn, place = cv2.solvePnP(corners, seen, matrix, lens, flags=cv2.SOLVEPNP_IPPE)
@@ -106,48 +86,43 @@ def locate(board: Board, rgb: Any, intrinsics: Any) -> Located:
     again = cv2.projectPoints(corners, turn, place, matrix, lens)[0].reshape(-1, 2)
     depth = corners @ pose[2, :3] + pose[2, 3]
     off = (again - seen) / [camera.fx, camera.fy]
-    return Located(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
+    return Calibration(pose, 1e3 * depth * np.linalg.norm(off, axis=1))
 
 
-def on_table(board: Located) -> np.ndarray:
-    """Returns the camera's pose [4, 4] in the workspace, whose axes are the board's."""
-    return np.linalg.inv(board.pose)
+def _corners(board: Board, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the corners that are seen: [n, 2] px, and [n, 3] m in the board's axes."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    seen, numbers, *_ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(grey)
+    count = 0 if numbers is None else len(numbers)
+    if count < LEAST_CORNERS:
+        raise FailedError(
+            f"{count} of the board's {len(board.corners)} corners are seen, {LEAST_CORNERS} are "
+            "needed; bring it nearer, or give it more light"
+        )
+    return seen.reshape(-1, 2).astype(np.float64), board.corners[numbers.reshape(-1)]
 
 
-def hand_eye(boards: Sequence[Located], robot: Sequence[Any]) -> HandEye:
-    """Computes the pose of a fixed camera by a board in the gripper; Park and Martin 1994.
+def hand_eye(boards: Sequence[Calibration], robot: Sequence[Any]) -> Calibration:
+    """Computes a fixed camera's pose in the robot's frame by a board in the gripper.
 
-    Args: robot, poses [4, 4] from gripper to robot, one for each image. Raises SettingsError for
-    too few poses, and for poses that differ too little.
+    Park and Martin 1994. Args: robot, for each image the pose [4, 4] from gripper to robot. The
+    residual is the board's middle in the hand, from its mean. Raises SettingsError for too few
+    poses, and for poses that differ too little.
     """
     arms = [images.rigid(pose, "robot") for pose in robot]
-    if len(arms) != len(boards) or len(arms) < LEAST_POSES:
-        raise SettingsError(
-            f"robot: give a pose of the arm for each image, {LEAST_POSES} or more, not "
-            f"{len(arms)} for {len(boards)}"
-        )
-    axes = [_turn(arms[0], arm) for arm in arms[1:]]
-    if np.linalg.svd(np.array(axes), compute_uv=False)[1] < LEAST_TURN:
-        raise SettingsError(
-            "robot: the poses turn about one axis; turn the hand about two, by 30 degrees or more"
-        )
-    back = [np.linalg.inv(arm) for arm in arms]  # OpenCV's names are of a camera in the hand
-    pose = np.eye(4)
-    pose[:3, :3], place = cv2.calibrateHandEye(
-        [inverse[:3, :3] for inverse in back],
-        [inverse[:3, 3] for inverse in back],
-        [board.pose[:3, :3] for board in boards],
-        [board.pose[:3, 3] for board in boards],
-        method=cv2.CALIB_HAND_EYE_PARK,
-    )
+    counts = f"{LEAST_POSES} or more, not {len(arms)} for {len(boards)}"
+    enough = len(arms) == len(boards) and len(arms) >= LEAST_POSES
+    require(enough, f"robot: give a pose of the arm for each image, {counts}")
+    axes = [cv2.Rodrigues(arms[0][:3, :3].T @ arm[:3, :3])[0].ravel() for arm in arms[1:]]  # rad
+    turned = np.linalg.svd(np.array(axes), compute_uv=False)[1] >= LEAST_TURN
+    remedy = "turn the hand about two, by 30 degrees or more"
+    require(turned, f"robot: the poses turn about one axis; {remedy}")
+    hands = np.linalg.inv(arms)  # OpenCV's names are of a camera in the hand
+    seen, pose = np.array([board.pose for board in boards]), np.eye(4)
+    solve: Any = functools.partial(cv2.calibrateHandEye, method=cv2.CALIB_HAND_EYE_PARK)
+    parts = hands[:, :3, :3], hands[:, :3, 3], seen[:, :3, :3], seen[:, :3, 3]
+    pose[:3, :3], place = solve(*parts)
     pose[:3, 3] = place.ravel()
-    middles = np.array(
-        [(arm @ pose @ board.pose)[:3, 3] for arm, board in zip(back, boards, strict=True)]
-    )
+    middles = (hands @ pose @ seen)[:, :3, 3]
     off = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
-    return HandEye(pose, 1e3 * off)
-
-
-def _turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the rotation vector [3] rad from one pose to another."""
-    return cv2.Rodrigues(a[:3, :3].T @ b[:3, :3])[0].ravel()
+    return Calibration(pose, 1e3 * off)

@@ -1,7 +1,7 @@
 """The camera's pose from points that the robot has touched: hand-eye calibration without a board.
 
-Mark five places or more, not on one line, at different heights if possible. Note each one's pixel
-in an image, touch it with the point between the closed finger tips, and note where the robot is.
+Mark five places or more, not on one line. Note each one's pixel in an image, touch it with the
+point between the closed finger tips, and note where the robot is.
 """
 
 from typing import Any, NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from csac_jax.deploy import images
-from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 LEAST = 4  # points: three fit always, and leave no residual
 SCALE_TOLERANCE = 0.02  # of distances in the image over distances touched (ours)
@@ -19,11 +19,10 @@ _LINE = 0.01  # m, least standard deviation of the points across the line throug
 
 
 class Calibration(NamedTuple):
-    """A camera's pose and how well it fits. n = points."""
+    """A pose, and its error at each of n measurements."""
 
-    pose: np.ndarray  # [4, 4] camera (x right, y down, z forward) to the frame of what was touched
-    residual_mm: np.ndarray  # [n] from each touched point to where the pose puts the seen one
-    scale: float  # distances between the seen points over those between the touched ones
+    pose: np.ndarray  # [4, 4]
+    residual_mm: np.ndarray  # [n]
 
 
 def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
@@ -33,11 +32,10 @@ def seen_points(depth: Any, intrinsics: Any, pixels: Any) -> np.ndarray:
     Raises SettingsError for pixels outside of the image, or with no depth around them.
     """
     camera, depth = images.Intrinsics.of(intrinsics), np.asarray(depth, np.float64)
-    if depth.shape != camera.shape:
-        raise SettingsError("depth: its size is not that of the intrinsics")
+    require(depth.shape == camera.shape, "depth: its size is not that of the intrinsics")
     places = _points(pixels, 2, "pixels").round().astype(int)
-    if np.any(places < 0) or np.any(places >= depth.shape[::-1]):
-        raise SettingsError("pixels: must lie in the image, column first")
+    inside = np.all((places >= 0) & (places < depth.shape[::-1]))
+    require(bool(inside), "pixels: must lie in the image, column first")
     distance = np.array([_median_depth(depth, col, row) for col, row in places])
     return images.rays(camera)[places[:, 1], places[:, 0]] * distance[:, None]
 
@@ -46,8 +44,8 @@ def _median_depth(depth: np.ndarray, col: int, row: int) -> float:
     top, left = max(row - _AROUND, 0), max(col - _AROUND, 0)
     around = depth[top : row + _AROUND + 1, left : col + _AROUND + 1]
     measured = around[around > 0.0]
-    if not measured.size:
-        raise SettingsError(f"pixels: there is no depth at column {col}, row {row}; choose another")
+    found = measured.size > 0
+    require(found, f"pixels: there is no depth at column {col}, row {row}; choose another")
     return float(np.median(measured))
 
 
@@ -58,33 +56,26 @@ def fit(seen: Any, touched: Any) -> Calibration:
     LEAST points, for points on a line, and for distances that differ by more than SCALE_TOLERANCE.
     """
     seen, touched = _points(seen, 3, "seen"), _points(touched, 3, "touched")
-    if len(seen) != len(touched) or len(seen) < LEAST:
-        raise SettingsError(
-            f"touched: give one point for each one seen, {LEAST} or more, not {len(touched)} for "
-            f"{len(seen)}"
-        )
+    counts = f"{LEAST} or more, not {len(touched)} for {len(seen)}"
+    enough = len(seen) == len(touched) and len(seen) >= LEAST
+    require(enough, f"touched: give one point for each one seen, {counts}")
     from_mean, to_mean = seen - seen.mean(axis=0), touched - touched.mean(axis=0)
-    if np.linalg.svd(to_mean, compute_uv=False)[1] < _LINE * len(seen) ** 0.5:
-        raise SettingsError("touched: the points lie on a line; choose some off it")
+    spread = np.linalg.svd(to_mean, compute_uv=False)[1] / len(seen) ** 0.5
+    require(spread >= _LINE, "touched: the points lie on a line; choose some off it")
     scale = float(np.linalg.norm(from_mean) / np.linalg.norm(to_mean))
-    if abs(scale - 1.0) > SCALE_TOLERANCE:
-        raise SettingsError(
-            f"seen: distances between the points are {scale:.3f} times those touched; check the "
-            "intrinsics, the unit of the depth, and the points"
-        )
+    fault = f"seen: distances between the points are {scale:.3f} times those touched"
+    remedy = "check the intrinsics, the unit of the depth, and the points"
+    require(abs(scale - 1.0) <= SCALE_TOLERANCE, f"{fault}; {remedy}")
     pose = np.eye(4)
     pose[:3, :3] = Rotation.align_vectors(to_mean, from_mean)[0].as_matrix()
     pose[:3, 3] = touched.mean(axis=0) - pose[:3, :3] @ seen.mean(axis=0)
     off = seen @ pose[:3, :3].T + pose[:3, 3] - touched
-    return Calibration(pose, 1e3 * np.linalg.norm(off, axis=1), scale)
+    return Calibration(pose, 1e3 * np.linalg.norm(off, axis=1))
 
 
 def _points(values: Any, size: int, name: str) -> np.ndarray:
     """Converts values to an array [n, size]. Raises SettingsError unless all are finite numbers."""
-    try:
-        points = np.array(values, np.float64)
-    except (TypeError, ValueError):
-        points = np.zeros(0)
-    if points.ndim != 2 or points.shape[1] != size or not np.isfinite(points).all():
-        raise SettingsError(f"{name}: must be rows of {size} finite numbers")
+    points = images.finite(values)
+    rows = points.shape[1:] == (size,)
+    require(rows, f"{name}: must be rows of {size} finite numbers")
     return points

@@ -5,7 +5,6 @@ They raise ViewError, one line that says what is wrong by how much.
 
 import dataclasses
 import warnings
-from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -28,72 +27,64 @@ _STEEPEST = 1.0  # largest slope of a table that is looked for
 _LEAST_TABLE = 0.15  # share of the points around the workspace that a table has at least
 _SWAPPED = 0.5  # ratio of distances to the blocks' colours that tells BGR from RGB
 _AROUND = 1.25  # side of the square in which the table is looked for, of the workspace's
-_UNITS = {  # measured over expected depth, as a power of ten -> what the numbers are
-    3: "millimetres; multiply it by 0.001",
-    2: "centimetres; multiply it by 0.01",
-    1: "scaled for 1 mm where the camera counts in 0.1 mm; multiply it by 0.1",
-    -1: "scaled for 0.1 mm where the camera counts in 1 mm; multiply it by 10",
-    -2: "divided by 100 too much; multiply it by 100",
-    -3: "scaled twice; multiply it by 1000",
-}
+_UNITS = {3: "millimetres", 2: "centimetres"}  # power of ten of measured over expected depth
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Table:
-    """A plane z = height + slope . (x, y) in the workspace's frame."""
+    """The table under and around the workspace, by an image."""
 
-    height: float  # m, above z = 0 at the workspace's centre
-    slope: np.ndarray  # [2] along x and y
-    noise: float  # m, standard deviation of the points on it
-
-    @property
-    def tilt_deg(self) -> float:
-        """Returns the angle between the plane and z = 0, degrees."""
-        return float(np.degrees(np.arctan(np.hypot(*self.slope))))
-
-    def worst(self, extent: float) -> float:
-        """Returns the largest distance from z = 0 over the square of side `extent` m, m."""
-        return float(abs(self.height) + 0.5 * extent * np.abs(self.slope).sum())
+    height_mm: float  # above z = 0, at the workspace's centre
+    tilt_deg: float
+    worst_mm: float  # largest distance from z = 0 in the workspace
+    noise_mm: float  # standard deviation of the points on it
 
 
-class CameraReport(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class CameraReport(Table):
     """Measurements in an image of the empty table, which show if pose and intrinsics fit."""
 
-    height_mm: float  # of the table above z = 0, at the workspace's centre
-    tilt_deg: float  # of the table
-    worst_mm: float  # largest distance of the table from z = 0 in the workspace
-    noise_mm: float  # standard deviation of the points on the table
     seen: float  # share of the workspace
     covered_cm2: float  # area higher than 1 cm, which an empty table has none of
 
+    @property
+    def faults(self) -> list[str]:
+        """Lists what must be mended before decisions are taken, one line each."""
+        faults = (
+            (self.worst_mm > 1e3 * TABLE_TOLERANCE, "the table is not at z = 0: measure the pose"),
+            (self.seen < SEEN_SHARE, "too little of the workspace is seen: move the camera"),
+            (self.covered_cm2 > CHANGE_AREA, "the table is not empty, or its depth too noisy"),
+        )
+        return [fault for holds, fault in faults if holds]
 
-def faults(report: CameraReport) -> list[str]:
-    """Lists what must be mended before decisions are taken, one line each."""
-    faults = {
-        "the table is not at z = 0: measure the pose again": (
-            report.worst_mm > 1e3 * TABLE_TOLERANCE
-        ),
-        "too little of the workspace is seen: move the camera": report.seen < SEEN_SHARE,
-        "the table is not empty, or its depth too noisy": report.covered_cm2 > CHANGE_AREA,
-    }
-    return [fault for fault, holds in faults.items() if holds]
+
+def fits(view: CameraView, cfg: HeightmapConfig) -> None:
+    """Runs all checks."""
+    pose(view)
+    depth_unit(view, cfg.extent)
+    plane = table(view, cfg.extent)
+    if plane.worst_mm > 1e3 * TABLE_TOLERANCE:
+        raise ViewError(
+            f"the table lies {plane.height_mm:+.0f} mm from z = 0, tilted by {plane.tilt_deg:.1f} "
+            f"degrees: {plane.worst_mm:.0f} mm at a corner of the workspace, "
+            f"{1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
+        )
+    _coverage(view, cfg)
+    colours(view, cfg.extent)
 
 
 def pose(view: CameraView) -> None:
     """Checks that the camera stands above the table and sees the workspace's centre."""
-    pose = view.pose
+    pose, far = view.pose, np.linalg.norm(view.pose[:3, 3])
     if np.abs(pose[:3, 3]).max() > HIGHEST_POSE:
-        far = np.linalg.norm(pose[:3, 3])
         raise ViewError(f"camera_pose: the camera is {far:.0f} m away; its unit is m")
     if _sees_centre(view, pose):
         return
-    flipped = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-    others = {
-        "it seems to map workspace to camera; give its inverse": np.linalg.inv(pose),
-        "its axes seem to be OpenGL's; turn y and z round": flipped,
-    }
-    hints = [hint for hint, other in others.items() if _sees_centre(view, other)]
-    hint = hints[0] if hints else "check it, x right, y down, z forward"
+    hint = "check it, x right, y down, z forward"
+    if _sees_centre(view, np.linalg.inv(pose)):
+        hint = "it seems to map workspace to camera; give its inverse"
+    elif _sees_centre(view, pose @ np.diag([1.0, -1.0, -1.0, 1.0])):
+        hint = "its axes seem to be OpenGL's; turn y and z round"
     raise ViewError(f"camera_pose: the workspace's centre is not in the image; {hint}")
 
 
@@ -106,9 +97,11 @@ def depth_unit(view: CameraView, extent: float) -> None:
     """Checks that depth is in metres: near to a table's by the pose."""
     ratio = _depth_ratio(view, extent)
     power = round(np.log10(ratio))
-    if power in _UNITS and abs(np.log10(ratio) - power) < 0.15:
-        text = f"depth is {ratio:.3g} times what camera_pose says: it seems to be {_UNITS[power]}"
-        raise ViewError(text)
+    if 1 <= abs(power) <= 3 and abs(np.log10(ratio) - power) < 0.15:
+        raise ViewError(
+            f"depth is {ratio:.3g} times what camera_pose says: it seems to be "
+            f"{_UNITS.get(power, 'wrongly scaled')}; multiply it by {10.0**-power:g}"
+        )
 
 
 def _depth_ratio(view: CameraView, extent: float) -> float:
@@ -128,20 +121,23 @@ def table(view: CameraView, extent: float) -> Table:
     every, valid = view.points[view.sparse], view.valid[view.sparse]
     near = valid & np.all(np.abs(every[..., :2]) <= 0.5 * _AROUND * extent, axis=-1)
     points = every[near].astype(np.float64)
-    plane = _largest_plane(points) if len(points) >= _LEAST else None
-    if plane is None:
-        ratio = _depth_ratio(view, extent)
-        raise ViewError(
-            "no table found where camera_pose says that the workspace is: depth there is "
-            f"{ratio:.2f} times that of a table at z = 0; check the pose, and what stands in view"
-        )
-    return plane
+    if len(points) >= _LEAST and (plane := _largest_plane(points)):
+        (height, x, y), noise = plane
+        worst = abs(height) + 0.5 * extent * (abs(x) + abs(y))
+        tilt_deg = np.degrees(np.arctan(np.hypot(x, y)))
+        return Table(1e3 * height, float(tilt_deg), 1e3 * worst, 1e3 * noise)
+    raise ViewError(
+        "no table found where camera_pose says that the workspace is: depth there is "
+        f"{_depth_ratio(view, extent):.2f} times that of a table at z = 0; check the pose, and "
+        "what stands in view"
+    )
 
 
-def _largest_plane(points: np.ndarray) -> Table | None:
-    """Fits the plane with most of the points [n, 3] m; None if no plane has enough.
+def _largest_plane(points: np.ndarray) -> tuple[list[float], float] | None:
+    """Fits the plane z = p0 + p1 x + p2 y with most of the points [n, 3] m, RANSAC, then twice
+    least squares.
 
-    RANSAC, then twice least squares.
+    Returns p and the standard deviation of the points on it; None if no plane has enough.
     """
     rng = np.random.default_rng(0)
     sample = points[rng.integers(len(points), size=_SAMPLE)]
@@ -160,17 +156,13 @@ def _largest_plane(points: np.ndarray) -> Table | None:
         if on.mean() < _LEAST_TABLE:
             return None
         plane = np.linalg.lstsq(basis[on], points[on, 2])[0]
-    return Table(float(plane[0]), plane[1:], float(np.std(points[on, 2] - basis[on] @ plane)))
+    return plane.tolist(), float(np.std(points[on, 2] - basis[on] @ plane))
 
 
-def table_height(table: Table, extent: float) -> None:
-    """Checks that the table lies at z = 0."""
-    if table.worst(extent) > TABLE_TOLERANCE:
-        raise ViewError(
-            f"the table lies {1e3 * table.height:+.0f} mm from z = 0, tilted by "
-            f"{table.tilt_deg:.1f} degrees: {1e3 * table.worst(extent):.0f} mm at a corner of the "
-            f"workspace, {1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
-        )
+def _cells(cfg: HeightmapConfig) -> tuple[np.ndarray, ...]:
+    """Returns x and y [H, W] m of the cells' centres."""
+    along = (np.arange(cfg.size) - 0.5 * (cfg.size - 1)) * cfg.cell
+    return np.meshgrid(along, along)
 
 
 def seen(view: CameraView, cfg: HeightmapConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -178,28 +170,25 @@ def seen(view: CameraView, cfg: HeightmapConfig) -> tuple[np.ndarray, np.ndarray
 
     Cells behind an object count as seen.
     """
-    along = (np.arange(cfg.size) - 0.5 * (cfg.size - 1)) * cfg.cell
-    x, y = np.meshgrid(along, along)
-    pixel, inside = view.project(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
+    x, y = _cells(cfg)
+    centres = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    pixel, inside = images.project(view.intrinsics, view.pose, centres)
     col, row = np.where(inside[:, None], np.round(pixel), 0).astype(int).T
     has_depth = ndimage.maximum_filter(view.valid, _WINDOW)[row, col] & inside
     return inside.reshape(x.shape), has_depth.reshape(x.shape)
 
 
-def coverage(view: CameraView, cfg: HeightmapConfig) -> float:
-    """Returns the seen share of the workspace, which must be enough."""
+def _coverage(view: CameraView, cfg: HeightmapConfig) -> None:
+    """Checks that enough of the workspace is seen."""
     inside, has_depth = seen(view, cfg)
-    share = float(has_depth.mean())
-    if share < SEEN_SHARE:
-        side = (np.arange(cfg.size) - 0.5 * (cfg.size - 1)) * cfg.cell
-        rows, cols = np.nonzero(~has_depth)
-        x, y = (np.percentile(side[index], (2, 98)) for index in (cols, rows))
-        cause = "has no depth" if inside[~has_depth].mean() > 0.5 else "is outside of the image"
-        raise ViewError(
-            f"{share:.0%} of the workspace is seen, {SEEN_SHARE:.0%} are needed: x {x[0]:+.2f} to "
-            f"{x[1]:+.2f} m, y {y[0]:+.2f} to {y[1]:+.2f} m {cause}; move the camera"
-        )
-    return share
+    if has_depth.mean() >= SEEN_SHARE:
+        return
+    x, y = (np.percentile(places[~has_depth], (2, 98)) for places in _cells(cfg))
+    cause = "has no depth" if inside[~has_depth].mean() > 0.5 else "is outside of the image"
+    raise ViewError(
+        f"{has_depth.mean():.0%} of the workspace is seen, {SEEN_SHARE:.0%} are needed: x "
+        f"{x[0]:+.2f} to {x[1]:+.2f} m, y {y[0]:+.2f} to {y[1]:+.2f} m {cause}; move the camera"
+    )
 
 
 def colours(view: CameraView, extent: float) -> None:

@@ -44,15 +44,9 @@ def from_choice(choice: Choice, workspace_pose: np.ndarray) -> Decision:
         _waypoint(name, station, workspace_pose)
         for name, station in zip(STATIONS, np.asarray(choice.stations, float), strict=True)
     )
-    lowest = waypoints[1]
-    return Decision(
-        primitive=Primitive(int(choice.action.primitive)).name.lower(),
-        position=lowest.position,
-        yaw=lowest.yaw,
-        width=lowest.opening,
-        score=float(choice.score),
-        waypoints=waypoints,
-    )
+    _, position, yaw, width, _ = waypoints[1]
+    primitive = Primitive(int(choice.action.primitive)).name.lower()
+    return Decision(primitive, position, yaw, width, float(choice.score), waypoints)
 
 
 def _waypoint(name: str, station: np.ndarray, workspace_pose: np.ndarray) -> Waypoint:

@@ -9,13 +9,13 @@ import numpy as np
 
 from csac_jax import geometry, grippers
 from csac_jax.agent import actor_critic, maps, policy, values
-from csac_jax.agent.actor_critic import ActorCritic, Params
+from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
-from csac_jax.errors import SettingsError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
+from csac_jax.section import require
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 
@@ -32,10 +32,9 @@ class Choice(NamedTuple):
 
 
 def observe(cfg: Config, points: Any, valid: Any, colour: Any, target: Any) -> Observation:
-    """Projects an image's pixels to the view from above. Leaves out points above VIEW_HEIGHT.
+    """Projects points [n, 3] m of the workspace below VIEW_HEIGHT to the view from above.
 
-    Args: points [n, 3] m, workspace frame; valid [n] bool; colour [n, 3] uint8; target [n] bool, or
-    None if any object will do.
+    Args: valid [n] bool; colour [n, 3] uint8; target [n] bool, or None if any object will do.
     """
     cells = heightmap.from_points(cfg.heightmap, points, valid & (points[:, 2] < VIEW_HEIGHT))
     seen = colour.at[cells.source].get(mode="promise_in_bounds").astype(jnp.float32) / 255.0
@@ -52,9 +51,9 @@ def fingers(cfg: Config) -> jax.Array | None:
     Raises SettingsError for a gripper that varies: a robot has one.
     """
     gripper = grippers.load(cfg.sim.gripper)
-    if gripper.varies is not None:
-        known = ", ".join(grippers.shipped())
-        raise SettingsError(f"gripper: name the robot's, one of {known}, or its folder")
+    known = ", ".join(grippers.shipped())
+    fault = f"gripper: name the robot's, one of {known}, or its folder"
+    require(gripper.varies is None, fault)
     return jnp.array(gripper.fingers, jnp.float32) if cfg.net.gripper else None
 
 
@@ -75,14 +74,17 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
 
 def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, DenseMaps]:
     """Returns the best action in a state of height map [H, W] m, and the state without the cells
-    near it."""
+    of this primitive within APART of it."""
     learner = actor_critic.make(cfg)
     best = policy.greedy(jax.random.key(0), learner, state, jnp.int32(0))
     pose = maps.denormalise(learner.frames, best.poses[best.primitive])
     action = Action(primitive=best.primitive, pose=pose)
     valid = maps.is_valid(learner.frames, state.valid, best.primitive, pose)
     choice = Choice(action, best.values[best.primitive], valid, stations(cfg, height, action))
-    return choice, _without(learner, state, action)
+    offset = learner.frames.xy - pose[:2][None, None, None]
+    far = jnp.sum(offset**2, axis=-1) >= APART**2  # [K, h, w]
+    other = jnp.arange(len(Primitive)) != best.primitive
+    return choice, state.replace(valid=state.valid & (far[None] | other[:, None, None, None]))
 
 
 def stations(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
@@ -92,14 +94,6 @@ def stations(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
     ends = [np.cumsum(phases) - 1 for phases in (cfg.sim.push_phases, cfg.sim.grasp_phases)]
     last = jnp.where(is_grasp, ends[1], ends[0])
     return jnp.concatenate([plan.start[None], plan.control[last]])
-
-
-def _without(learner: ActorCritic, state: DenseMaps, action: Action) -> DenseMaps:
-    """Removes the cells of this primitive within APART of the action."""
-    offset = learner.frames.xy - action.pose[:2][None, None, None]
-    far = jnp.sum(offset**2, axis=-1) >= APART**2  # [K, h, w]
-    other = jnp.arange(len(Primitive)) != action.primitive
-    return state.replace(valid=state.valid & (far[None] | other[:, None, None, None]))
 
 
 def best_over_yaws(cfg: Config, state: DenseMaps) -> jax.Array:

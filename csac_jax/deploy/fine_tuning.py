@@ -1,29 +1,40 @@
 """A policy learns from a record of its own actions, see `record`; no scene is simulated.
 
-    policy, summary = fine_tuning.run(CameraPolicy.load("shipped"), Path("record"))
-
-The learner's modules need MuJoCo installed.
+It learns from the height maps that were decided on. The learner's modules need MuJoCo installed.
+n = transitions.
 """
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from csac_jax.agent.learner import Learner, Transition
+from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, UniformReplay
-from csac_jax.constants import Outcome
-from csac_jax.deploy import CameraPolicy, experience, record
-from csac_jax.errors import FailedError
+from csac_jax.constants import CHANGE_AREA, OUTCOMES, Outcome, Primitive
+from csac_jax.deploy import CameraPolicy, record
+from csac_jax.deploy.record import PUSHED, Entry
+from csac_jax.errors import FailedError, SettingsError
+from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import offline
 from csac_jax.training.offline import OfflineState
+from csac_jax.vision import heightmap
+from csac_jax.vision.heightmap import PackedObservation
 
 UPDATES = 10  # of the critic in a step, after which the actor has one (ours)
+_AT_ONCE = 32  # transitions that are rewarded together: their maps fill the memory
+
+Progress = Callable[[int, int, float, float], None]
+"""Takes updates, all updates, mean abs(y - Q) in the step, and seconds since the first began."""
 
 
 class Settings(NamedTuple):
@@ -33,15 +44,6 @@ class Settings(NamedTuple):
     learning_rate: float = 3e-4  # Adam's step size, critic; the actor's is a third
     batch: int = 16
     seed: int = 0
-
-
-class FineTuningProgress(NamedTuple):
-    """The state of the learning after a step."""
-
-    updates: int
-    total: int
-    td_error: float  # mean of abs(y - Q) in the step
-    seconds: float  # since the first step began
 
 
 class FineTuningSummary(NamedTuple):
@@ -55,29 +57,21 @@ class FineTuningSummary(NamedTuple):
     stopped_by: int | None  # number of the signal; None if all is done
 
 
-def configure(cfg: Config, settings: Settings, num: int) -> Config:
-    """Returns the config of a fine-tuning on `num` transitions.
+class Experience(NamedTuple):
+    """The content of a record. NumPy leaves [n, ...]."""
 
-    They are drawn uniformly: ranks by error would repeat the few whose outcome was luck.
-    """
-    steps = -(-settings.updates // UPDATES)
-    learn = {
-        "learning_rate": settings.learning_rate,
-        "actor_learning_rate": settings.learning_rate / 3.0,
-        "batch": settings.batch,
-        "actor_batch": 0,
-        "updates": UPDATES,
-    }
-    train = {"scenes": 1, "actions": steps, "learning_starts": settings.batch}
-    small = cfg.change(learn=learn, train=train)
-    return dataclasses.replace(small, replay=UniformReplay(capacity=max(num, settings.batch)))
+    obs: PackedObservation
+    action: Action
+    outcome: Any  # [n] int32, Outcome; NOTHING of pushes
+    next_obs: PackedObservation
+    terminated: Any  # [n] bool
 
 
 def run(
     policy: CameraPolicy,
     folder: Path,
     settings: Settings = Settings(),  # noqa: B008, it is immutable
-    on_progress: Callable[[FineTuningProgress], None] = lambda _: None,
+    on_progress: Progress = lambda *_: None,
     stop: Stop | None = None,
 ) -> tuple[CameraPolicy, FineTuningSummary]:
     """Returns the policy after learning from the record in `folder`, or until `stop`.
@@ -86,39 +80,118 @@ def run(
     FailedError if a loss is not finite.
     """
     cache.enable()
-    recorded = experience.load(policy, record.read(folder))
+    stop = stop or Stop()
+    recorded = load(policy, record.read(folder))
     program = offline.make(configure(policy.cfg, settings, len(recorded.outcome)))
     key, learner = jax.random.key(settings.seed), offline.init(program, policy.params)
-    rewarded = experience.transitions(policy, program.learner, learner, recorded)
+    rewarded = transitions(policy, program.learner, learner, recorded)
     state = OfflineState(key, jnp.int32(0), learner, offline.fill(program, rewarded))
-    state, errors, seconds = _learn(program, state, on_progress, stop or Stop())
-    ends = (errors[0], errors[-1]) if errors else (0.0, 0.0)
-    signal = None if stop is None else stop.signal
+    state, errors, seconds = _learn(program, state, on_progress, stop)
     lifted = int((recorded.outcome == Outcome.LIFTED).sum())
-    done = FineTuningSummary(
-        len(recorded.outcome), lifted, len(errors) * UPDATES, ends, seconds, signal
-    )
-    return dataclasses.replace(policy, params=state.learner.online), done
+    ends = (errors[0], errors[-1]) if errors else (0.0, 0.0)
+    updates, num = len(errors) * UPDATES, len(recorded.outcome)
+    summary = FineTuningSummary(num, lifted, updates, ends, seconds, stop.signal)
+    return dataclasses.replace(policy, params=state.learner.online), summary
+
+
+def configure(cfg: Config, settings: Settings, num: int) -> Config:
+    """Returns the config of a fine-tuning on `num` transitions.
+
+    They are drawn uniformly: ranks by error would repeat the few whose outcome was luck.
+    """
+    learn: dict[str, Any] = {"batch": settings.batch, "actor_batch": 0, "updates_per_step": UPDATES}
+    learn["learning_rate"] = settings.learning_rate
+    learn["actor_learning_rate"] = settings.learning_rate / 3.0
+    steps = -(-settings.updates // UPDATES)
+    train = {"scenes": 1, "actions": steps, "learning_starts": settings.batch}
+    small = cfg.change(learn=learn, train=train)
+    return dataclasses.replace(small, replay=UniformReplay(capacity=max(num, settings.batch)))
 
 
 def _learn(
-    program: offline.Program,
-    state: OfflineState,
-    on_progress: Callable[[FineTuningProgress], None],
-    stop: Stop,
+    program: offline.Program, state: OfflineState, on_progress: Progress, stop: Stop
 ) -> tuple[OfflineState, list[float], float]:
     """Runs all steps; returns the state, the TD error of each step, and the seconds."""
-    total = program.cfg.train.steps
-    errors: list[float] = []
-    step = offline.compile_step(program)
-    begun = time.perf_counter()
+    total, step = program.cfg.train.steps, offline.compile_step(program)
+    errors, begun = list[float](), time.perf_counter()
     while len(errors) < total and stop.signal is None:
         state, losses = step(state)
         errors.append(float(losses["td_error"]))
+        updates = len(errors) * UPDATES
         if not jnp.isfinite(losses["critic_loss"] + losses["actor_loss"]):
             raise FailedError(
-                f"the loss is not finite after {len(errors) * UPDATES} updates; lower learning_rate"
+                f"the loss is not finite after {updates} updates; lower learning_rate"
             )
-        seconds = time.perf_counter() - begun
-        on_progress(FineTuningProgress(len(errors) * UPDATES, total * UPDATES, errors[-1], seconds))
+        on_progress(updates, total * UPDATES, errors[-1], time.perf_counter() - begun)
     return jax.block_until_ready(state), errors, time.perf_counter() - begun
+
+
+def load(policy: CameraPolicy, entries: list[Entry]) -> Experience:
+    """Loads the actions whose outcome is known, seen as `policy` sees.
+
+    The next entry shows what an action led to. An action without one is left out, unless its scene
+    ended. Raises SettingsError for damaged entries, and if no action is left.
+    """
+    by_number = {int(entry.path.name): entry for entry in entries}
+    observed = functools.cache(lambda number: _observed(policy, by_number[number]))
+    rows = []
+    for number, entry in by_number.items():
+        if entry.outcome is None or not (entry.outcome.ended or number + 1 in by_number):
+            continue
+        ended = entry.outcome.ended
+        after = observed(number if ended else number + 1)
+        rows.append(Experience(observed(number), *_done(entry), after, np.bool_(ended)))
+    if not rows:
+        needed = "an action with an outcome and an image after it"
+        raise SettingsError(f"the record lacks {needed}; post outcomes, see docs/robot.md")
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
+def _observed(policy: CameraPolicy, entry: Entry) -> PackedObservation:
+    """Returns the policy's view of an entry's image. The mask counts in the task `target`."""
+    rgb, depth, lens, pose, mask = entry.image
+    try:
+        marked = mask if policy.cfg.task.kind == "target" else None
+        obs = policy.observe(rgb, depth, lens, pose, marked)
+    except (SettingsError, FailedError) as error:
+        raise SettingsError(f"{entry.path}: {error}") from None
+    return jax.device_get(heightmap.pack(obs))
+
+
+def _done(entry: Entry) -> tuple[Action, Any]:
+    """Returns the action of an entry and its outcome, NumPy leaves [...]."""
+    assert entry.outcome is not None
+    primitive, place = entry.action
+    name = entry.outcome.outcome
+    level = Outcome.NOTHING if name == PUSHED else Outcome(OUTCOMES.index(name))
+    pose: Any = np.array(place, np.float32)
+    kind: Any = np.int32(Primitive[primitive.upper()])
+    return Action(kind, pose), np.int32(level)
+
+
+def transitions(
+    policy: CameraPolicy, learner: Learner, state: Any, experience: Experience
+) -> Transition:
+    """Returns the transitions of an experience, rewarded as in training, leaves [n, ...]."""
+    parts = []
+    for i in range(0, len(experience.outcome), _AT_ONCE):
+        part = jax.tree.map(lambda leaf, i=i: leaf[i : i + _AT_ONCE], experience)
+        parts.append(jax.device_get(_rewarded(policy.cfg, learner, state, part)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _rewarded(cfg: Config, learner: Learner, state: Any, part: Experience) -> Transition:
+    """Computes the rewards; lost blocks, distances and values of states are unknown, cost 0."""
+    unknown = jnp.zeros(part.outcome.shape)
+    obs, after = heightmap.unpack(part.obs), heightmap.unpack(part.next_obs)
+    moved = jax.vmap(heightmap.moved_area, (None, 0, 0))(cfg.heightmap, obs.height, after.height)
+    done = part.action.primitive, part.outcome
+    changed, lost = moved > CHANGE_AREA, jnp.zeros(part.outcome.shape, jnp.int32)
+    result = ActionResult(*done, unknown, unknown, unknown, changed, lost)
+    reward, better = learner.reward(cfg.reward, state, obs, after, result)
+    end = part.terminated
+    if cfg.target.bootstrap == "continuing":  # nothing follows an action without any effect
+        end |= ~(result.changed | (part.outcome == Outcome.LIFTED))
+    label = better if cfg.reward.relabels else None
+    return Transition(part.obs, part.action, reward, part.next_obs, end, label)

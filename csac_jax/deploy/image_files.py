@@ -13,6 +13,7 @@ from csac_jax.deploy import images
 from csac_jax.deploy.images import Intrinsics
 from csac_jax.errors import SettingsError, first_fault
 from csac_jax.io import files
+from csac_jax.section import require
 
 
 class PoseBody(pydantic.BaseModel, extra="forbid"):
@@ -29,18 +30,17 @@ def read_rgb(path: Path) -> np.ndarray:
 def read_depth(path: Path) -> np.ndarray:
     """Reads depth [h, w] float32 m: a PNG of 16 bits in mm, or an .npy of floats in m."""
     if path.suffix != ".npy":
-        return metres(_read(path, decode), str(path))
+        return _read(path, lambda content: metres(decode(content)))
     depth: np.ndarray = _read(path, _array)
-    if depth.dtype.kind != "f":
-        raise SettingsError(f"{path}: is {depth.dtype}; an .npy file holds metres as float32")
+    fault = f"{path}: is {depth.dtype}; an .npy file holds metres as float32"
+    require(depth.dtype.kind == "f", fault)
     return depth
 
 
 def read_mask(path: Path) -> np.ndarray:
     """Reads a mask [h, w] bool, True where an image or an .npy is not 0."""
     mask: np.ndarray = _read(path, _array if path.suffix == ".npy" else decode)
-    if mask.ndim != 2:
-        raise SettingsError(f"{path}: a mask has one channel, not shape {list(mask.shape)}")
+    require(mask.ndim == 2, f"{path}: a mask has one channel, not shape {list(mask.shape)}")
     return mask != 0
 
 
@@ -51,22 +51,18 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 def read_pose(path: Path) -> np.ndarray:
     """Reads {"matrix": 4 x 4 rows}, m."""
-
-    def convert(content: bytes) -> np.ndarray:
-        return images.rigid(PoseBody.model_validate_json(content).matrix, "matrix")
-
-    return _read(path, convert)
+    return images.rigid(read_json(path, PoseBody).matrix, f"{path}: matrix")
 
 
-def read_model(path: Path, kind: type[pydantic.BaseModel]) -> Any:
-    """Reads JSON as a model; errors name the key."""
-    return _read(path, kind.model_validate_json)
+def read_json(path: Path, kind: Any) -> Any:
+    """Reads JSON as a model or another type; errors name the key."""
+    return _read(path, pydantic.TypeAdapter(kind).validate_json)
 
 
-def metres(depth: np.ndarray, name: str) -> np.ndarray:
+def metres(depth: np.ndarray) -> np.ndarray:
     """Converts depth of an image of 16 bits, in mm, to float32 m."""
-    if depth.dtype.itemsize < 2 or depth.dtype.kind not in "iu":
-        raise SettingsError(f"{name}: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
+    fits = depth.dtype.itemsize >= 2 and depth.dtype.kind in "iu"
+    require(fits, f"depth: is {depth.dtype}; give a PNG of 16 bits, in mm, or metres")
     return (1e-3 * depth).astype(np.float32)
 
 
@@ -85,13 +81,6 @@ def encode(pixels: np.ndarray, dots_per_inch: int = 72) -> bytes:
     return buffer.getvalue()
 
 
-def encode_array(values: np.ndarray) -> bytes:
-    """Encodes an array as the content of an .npy file."""
-    buffer = io.BytesIO()
-    np.save(buffer, values, allow_pickle=False)
-    return buffer.getvalue()
-
-
 def _array(content: bytes) -> np.ndarray:
     return np.load(io.BytesIO(content), allow_pickle=False)
 
@@ -102,7 +91,7 @@ def _read(path: Path, convert: Callable[[bytes], Any]) -> Any:
         return convert(files.read_bytes(path))
     except FileNotFoundError:
         raise SettingsError(f"there is no file {path}") from None
-    except pydantic.ValidationError as error:
-        raise SettingsError(f"{path}: {first_fault(error)}") from None
     except Exception as error:  # damaged files raise nearly anything
-        raise SettingsError(f"{path}: {files.first_line(error)}") from None
+        known = isinstance(error, pydantic.ValidationError)
+        reason = first_fault(error) if known else files.first_line(error)
+        raise SettingsError(f"{path}: {reason}") from None

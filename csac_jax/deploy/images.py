@@ -6,12 +6,14 @@ is along z. A pose `T_workspace_camera` maps camera to workspace. h, w = rows an
 
 import dataclasses
 import functools
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import numpy as np
 import pydantic
+import pydantic.dataclasses
 
 from csac_jax.errors import SettingsError, first_fault
+from csac_jax.section import require
 
 MOST_PIXELS = 4096  # of a side
 _ROUNDS = 20  # of the iteration that removes distortion, as in OpenCV's undistortPoints
@@ -27,11 +29,10 @@ _Number = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=False)]
 _Positive = Annotated[_Number, pydantic.Field(gt=0.0)]
 
 
-@dataclasses.dataclass(frozen=True)
+@pydantic.dataclasses.dataclass(frozen=True, config={"extra": "forbid"})
 class Intrinsics:
-    """A pinhole camera, which `of` checks."""
+    """A pinhole camera."""
 
-    __pydantic_config__: ClassVar = {"extra": "forbid", "revalidate_instances": "always"}
     width: _Pixels
     height: _Pixels
     fx: _Positive  # px
@@ -48,9 +49,9 @@ class Intrinsics:
 
     @classmethod
     def of(cls, values: Any) -> "Intrinsics":
-        """Returns checked intrinsics of others, or of a mapping. Raises SettingsError."""
+        """Returns intrinsics, or those of a mapping. Raises SettingsError for bad ones."""
         try:
-            return _adapter().validate_python(values)
+            return pydantic.TypeAdapter(cls).validate_python(values)
         except pydantic.ValidationError as error:
             raise SettingsError(f"intrinsics: {first_fault(error)}") from None
 
@@ -58,11 +59,6 @@ class Intrinsics:
     def shape(self) -> tuple[int, int]:
         """Returns rows and columns of the image."""
         return self.height, self.width
-
-
-@functools.cache
-def _adapter() -> pydantic.TypeAdapter[Intrinsics]:
-    return pydantic.TypeAdapter(Intrinsics)
 
 
 def distort(intrinsics: Intrinsics, xy: np.ndarray) -> np.ndarray:
@@ -83,35 +79,36 @@ def rays(intrinsics: Intrinsics) -> np.ndarray:
     Raises SettingsError for a distortion that has no inverse over the image.
     """
     u, v = np.meshgrid(np.arange(intrinsics.width), np.arange(intrinsics.height))
-    distorted = np.stack(
-        [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy], -1
-    )
-    ideal = distorted
+    x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+    ideal = distorted = np.stack([x, y], axis=-1)
     if any(intrinsics.distortion):
         with np.errstate(all="ignore"):  # it may diverge
             for _ in range(_ROUNDS):
                 ideal = ideal + distorted - distort(intrinsics, ideal)
             error = np.abs(distort(intrinsics, ideal) - distorted).max() * intrinsics.fx
-        if not error < 0.1:
-            raise SettingsError("intrinsics.distortion: has no inverse over the image; rectify it")
+        fault = "intrinsics.distortion: has no inverse over the image; rectify it"
+        require(bool(error < 0.1), fault)
     return np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=-1).astype(np.float32)
+
+
+def finite(values: Any) -> np.ndarray:
+    """Converts to float64; returns an empty array unless all are finite numbers."""
+    try:
+        array = np.array(values, np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
+    return array if np.isfinite(array).all() else np.empty(0)
 
 
 def rigid(matrix: Any, name: str) -> np.ndarray:
     """Converts a matrix to a pose [4, 4] float64. Raises SettingsError if it is not rigid."""
-    try:
-        pose = np.array(matrix, np.float64)
-    except (TypeError, ValueError):
-        raise SettingsError(f"{name}: must be a 4 x 4 matrix of numbers") from None
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise SettingsError(f"{name}: must be a 4 x 4 matrix of finite numbers")
+    pose = finite(matrix)
+    require(pose.shape == (4, 4), f"{name}: must be a 4 x 4 matrix of finite numbers")
     rotation = pose[:3, :3]
     square = np.abs(rotation @ rotation.T - np.eye(3)).max() < _RIGID
-    if not square or np.linalg.det(rotation) < 0.0 or np.any(pose[3] != [0.0, 0.0, 0.0, 1.0]):
-        raise SettingsError(
-            f"{name}: must be a rotation and a translation in m, last row 0 0 0 1; it may be "
-            "transposed, scaled or mirrored"
-        )
+    is_rigid = square and np.linalg.det(rotation) >= 0.0 and np.all(pose[3] == [0, 0, 0, 1])
+    form = "a rotation and a translation in m, last row 0 0 0 1"
+    require(bool(is_rigid), f"{name}: must be {form}; it may be transposed, scaled or mirrored")
     return pose
 
 
@@ -147,19 +144,16 @@ class CameraView:
     @property
     def sparse(self) -> tuple[slice, slice]:
         """Returns rows and columns of some 20,000 pixels all over the image, for measurements."""
-        step = max(1, int(np.sqrt(self.depth.size / 20_000)))
-        return slice(None, None, step), slice(None, None, step)
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Projects points [n, 3] m of the workspace: column and row [n, 2] px, and [n] bool, True
-        inside the image."""
-        return project(self.intrinsics, self.pose, points)
+        return (slice(None, None, max(1, int(np.sqrt(self.depth.size / 20_000)))),) * 2
 
 
 def project(
     intrinsics: Intrinsics, pose: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Projects points as `CameraView.project`."""
+    """Projects points [n, 3] m of the workspace to a camera at `pose`.
+
+    Returns column and row [n, 2] px, and [n] bool, True inside the image.
+    """
     x, y, depth = ((points - pose[:3, 3]) @ pose[:3, :3]).T
     ahead = depth > 1e-3
     ideal = np.stack([x, y], axis=1) / np.where(ahead, depth, 1.0)[:, None]
@@ -179,42 +173,32 @@ def make(
     camera, pose = Intrinsics.of(intrinsics), rigid(camera_pose, "camera_pose")
     colour, metres = _colour(np.asarray(rgb)), _depth(np.asarray(depth))
     target = None if target_mask is None else _mask(np.asarray(target_mask))
-    arrays = {"rgb": colour, "depth": metres, "target_mask": target}
+    arrays = {"rgb": colour, "depth": metres, "target_mask": target, "intrinsics": camera}
     sizes = {name: array.shape[:2] for name, array in arrays.items() if array is not None}
-    if set(sizes.values()) != {camera.shape}:
-        shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
-        wanted = f"{camera.width} x {camera.height}"
-        raise SettingsError(f"{shown}, intrinsics {wanted}: align them to one camera and one size")
+    shown = ", ".join(f"{name} {cols} x {rows}" for name, (rows, cols) in sizes.items())
+    require(len(set(sizes.values())) == 1, f"{shown}: align them to one camera and one size")
     valid = np.isfinite(metres) & (metres > 0.0)
-    return CameraView(
-        colour, np.where(valid, metres, 0.0).astype(np.float32), valid, target, camera, pose
-    )
+    metres = np.where(valid, metres, 0.0).astype(np.float32)
+    return CameraView(colour, metres, valid, target, camera, pose)
 
 
 def _colour(rgb: np.ndarray) -> np.ndarray:
-    if rgb.ndim != 3 or rgb.shape[2] != 3:
-        hint = "; leave out its alpha: rgb[..., :3]" if rgb.ndim == 3 and rgb.shape[2] == 4 else ""
-        raise SettingsError(f"rgb: must have shape [rows, columns, 3], not {list(rgb.shape)}{hint}")
-    if rgb.dtype != np.uint8:
-        scale = "rgb * 255 as uint8" if rgb.dtype.kind == "f" else "values 0 to 255 as uint8"
-        raise SettingsError(f"rgb: is {rgb.dtype}; give {scale}, red first")
+    hint = "; leave out its alpha: rgb[..., :3]" if rgb.shape[2:] == (4,) else ""
+    shape = f"rgb: must have shape [rows, columns, 3], not {list(rgb.shape)}{hint}"
+    require(rgb.shape[2:] == (3,), shape)
+    require(rgb.dtype == np.uint8, f"rgb: is {rgb.dtype}; give 0 to 255 as uint8, red first")
     return rgb
 
 
 def _depth(depth: np.ndarray) -> np.ndarray:
-    if depth.ndim != 2:
-        raise SettingsError(f"depth: must have shape [rows, columns], not {list(depth.shape)}")
-    if depth.dtype.kind != "f":
-        raise SettingsError(
-            f"depth: is {depth.dtype}, which has no unit; give metres as float: "
-            "depth * 0.001 for millimetres"
-        )
+    require(depth.ndim == 2, f"depth: must have shape [rows, columns], not {list(depth.shape)}")
+    remedy = "give metres as float: depth * 0.001 for millimetres"
+    require(depth.dtype.kind == "f", f"depth: is {depth.dtype}, which has no unit; {remedy}")
     return depth
 
 
 def _mask(mask: np.ndarray) -> np.ndarray:
-    if mask.ndim != 2 or mask.dtype.kind not in "bu":
-        raise SettingsError("target_mask: must be bool or whole numbers [rows, columns]")
-    if not mask.any():
-        raise SettingsError("target_mask: marks no pixel; mark the object, or leave the mask out")
+    fits = mask.ndim == 2 and mask.dtype.kind in "bu"
+    require(fits, "target_mask: must be bool or whole numbers [rows, columns]")
+    require(bool(mask.any()), "target_mask: marks no pixel; mark the object, or leave the mask out")
     return mask != 0

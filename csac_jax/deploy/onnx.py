@@ -39,14 +39,9 @@ def serialize(cfg: Config, params: Params) -> bytes:
         raise SettingsError("format onnx: knows net.kind small only; take stablehlo")
     shapes = stablehlo.map_shapes(cfg)
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)  # it warns of shapes that nobody reads
-    model = jax2onnx.to_onnx(
-        _decide(cfg, params),
-        shapes,
-        opset=OPSET,
-        return_mode="ir",
-        input_names=INPUTS[: len(shapes)],
-        output_names=OUTPUTS,
-    )
+    names = {"input_names": INPUTS[: len(shapes)], "output_names": OUTPUTS}
+    program = _decide(cfg, params)
+    model = jax2onnx.to_onnx(program, shapes, opset=OPSET, return_mode="ir", **names)
     common.RemoveUnusedNodesPass()(model)
     content: bytes = serde.serialize_model(model).SerializeToString()
     return content

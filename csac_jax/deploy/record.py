@@ -10,7 +10,8 @@ once. Errors are SettingsErrors, one line that names the file.
 """
 
 import datetime
-import json
+import io
+import itertools
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -25,6 +26,7 @@ from csac_jax.deploy import image_files, images
 from csac_jax.deploy.decision import Decision
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
+from csac_jax.section import require
 
 FORMAT = 1
 PUSHED = "pushed"  # the outcome of every push: its effect is seen in the next image
@@ -45,12 +47,12 @@ class ReportedOutcome(pydantic.BaseModel, extra="forbid", strict=True, frozen=Tr
 
     def check(self, decisions: Sequence[dict[str, Any]]) -> None:
         """Raises SettingsError if it is no outcome of these decisions."""
-        if self.number > len(decisions):
-            raise SettingsError(f"number: there are {len(decisions)} decisions, not {self.number}")
-        pushed = decisions[self.number - 1]["primitive"] == "push"
-        if pushed != (self.outcome == PUSHED):
-            primitive, names = ("push", PUSHED) if pushed else ("grasp", ", ".join(OUTCOMES))
-            raise SettingsError(f"outcome: of a {primitive} it is {names}, not {self.outcome}")
+        num = len(decisions)
+        require(self.number <= num, f"number: there are {num} decisions, not {self.number}")
+        primitive = decisions[self.number - 1]["primitive"]
+        outcomes = (PUSHED,) if primitive == "push" else OUTCOMES
+        fault = f"outcome: of a {primitive} it is {', '.join(outcomes)}, not {self.outcome}"
+        require(self.outcome in outcomes, fault)
 
 
 class _StoredDecision(pydantic.BaseModel, extra="allow", strict=True):
@@ -63,10 +65,6 @@ class _StoredDecision(pydantic.BaseModel, extra="allow", strict=True):
 
 class _DecisionFile(pydantic.BaseModel, strict=True):
     decisions: list[_StoredDecision]
-
-
-class _Head(pydantic.BaseModel):
-    format: Any = None
 
 
 class Entry(NamedTuple):
@@ -104,18 +102,18 @@ class Recorder:
         anything else."""
         self._folder, self._policy = folder, policy
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            check(folder)
+            _check(folder)
         else:
             files.write_json(folder / _HEAD, {"format": FORMAT})
 
     def add(self, image: Image, decisions: Sequence[Decision]) -> str:
         """Stores an image and its decisions; returns the entry's name. Raises OSError."""
+        now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        listed = [decision.to_dict() for decision in decisions]
+        content = {"time": now, "policy": self._policy, "decisions": listed}
         draft = Path(tempfile.mkdtemp(prefix=".", dir=self._folder))
         try:
             _write(draft, image)
-            about = {"time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
-            listed = [decision.to_dict() for decision in decisions]
-            content = {**about, "policy": self._policy, "decisions": listed}
             files.write_json(draft / _DECISION, content)
             draft.chmod(0o755)
             return _publish(self._folder, draft)
@@ -139,21 +137,18 @@ def is_name(name: str) -> bool:
     return len(name) >= _DIGITS and name.isascii() and name.isdigit()
 
 
-def check(folder: Path) -> None:
+def _check(folder: Path) -> None:
     """Raises SettingsError for a folder that is no record, or is of another format."""
-    if not (folder / _HEAD).is_file():
-        raise SettingsError(f"{folder} is no record: it has no {_HEAD}; give another folder")
-    number = image_files.read_model(folder / _HEAD, _Head).format
-    if number != FORMAT:
-        raise SettingsError(
-            f"{folder}: format {number!r:.20} is unknown, this version reads {FORMAT}; "
-            "update csac-jax"
-        )
+    fault = f"{folder} is no record: it has no {_HEAD}; give another folder"
+    require((folder / _HEAD).is_file(), fault)
+    number = image_files.read_json(folder / _HEAD, dict[str, Any]).get("format")
+    known = f"this version reads {FORMAT}; update csac-jax"
+    require(number == FORMAT, f"{folder}: format {number!r:.20} is unknown, {known}")
 
 
 def read(folder: Path) -> list[Entry]:
     """Reads the entries of a record in their order, without images."""
-    check(folder)
+    _check(folder)
     names = sorted((path.name for path in folder.iterdir() if is_name(path.name)), key=int)
     return [_entry(folder / name) for name in names]
 
@@ -162,7 +157,7 @@ def _entry(folder: Path) -> Entry:
     decisions, path = _decisions(folder), folder / _OUTCOME
     if not path.exists():
         return Entry(folder, decisions, None)
-    outcome = image_files.read_model(path, ReportedOutcome)
+    outcome = image_files.read_json(path, ReportedOutcome)
     try:
         outcome.check(decisions)
     except SettingsError as error:
@@ -171,18 +166,17 @@ def _entry(folder: Path) -> Entry:
 
 
 def _decisions(folder: Path) -> list[dict[str, Any]]:
-    stored = image_files.read_model(folder / _DECISION, _DecisionFile)
-    return [decision.model_dump() for decision in stored.decisions]
+    stored = image_files.read_json(folder / _DECISION, _DecisionFile)
+    return stored.model_dump()["decisions"]
 
 
 def _write(folder: Path, image: Image) -> None:
     rgb, depth, intrinsics, pose, mask = image
     files.replace(folder / "rgb.png", image_files.encode(np.asarray(rgb)))
-    files.replace(folder / "depth.npy", image_files.encode_array(np.asarray(depth, np.float32)))
-    lens = vars(images.Intrinsics.of(intrinsics))
-    files.replace(folder / "intrinsics.json", json.dumps(lens) + "\n")
-    matrix = np.asarray(pose, np.float64).tolist()
-    files.replace(folder / "pose.json", json.dumps({"matrix": matrix}) + "\n")
+    np.save(values := io.BytesIO(), np.asarray(depth, np.float32), allow_pickle=False)
+    files.replace(folder / "depth.npy", values.getvalue())
+    files.write_json(folder / "intrinsics.json", vars(images.Intrinsics.of(intrinsics)))
+    files.write_json(folder / "pose.json", {"matrix": np.asarray(pose, np.float64).tolist()})
     if mask is not None:
         marked = np.where(np.asarray(mask) != 0, 255, 0).astype(np.uint8)
         files.replace(folder / "mask.png", image_files.encode(marked))
@@ -191,17 +185,13 @@ def _write(folder: Path, image: Image) -> None:
 def _publish(folder: Path, draft: Path) -> str:
     """Names a draft by the next free number; another process may take one meanwhile."""
     taken = [int(path.name) for path in folder.iterdir() if is_name(path.name)]
-    number = max(taken, default=0)
-    while True:
-        number += 1
-        name = f"{number:0{_DIGITS}d}"
+    for number in itertools.count(max(taken, default=0) + 1):
+        entry = folder / f"{number:0{_DIGITS}d}"
         try:
-            draft.rename(folder / name)  # fails where there is a folder with files
-        except FileExistsError:
-            continue
+            draft.rename(entry)  # fails where there is a folder with files
+            break
         except OSError:
-            if not (folder / name).exists():
+            if not entry.exists():
                 raise
-            continue
-        files.sync_folder(folder)
-        return name
+    files.sync_folder(folder)
+    return entry.name

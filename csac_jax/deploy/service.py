@@ -13,36 +13,41 @@ Decisions are taken one by one, and requests wait for their turn.
 
 import asyncio
 import base64
-import binascii
+import functools
 import secrets
 import struct
 import threading
 import time
 import warnings
-from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Annotated, Any
 
 import fastapi
 import numpy as np
 import pydantic
-from fastapi.exceptions import RequestValidationError
+from fastapi import Depends, HTTPException, Request
 from fastapi.responses import JSONResponse
+from starlette.requests import ClientDisconnect
 
 from csac_jax.deploy import CameraPolicy, image_files, images
 from csac_jax.deploy.image_files import PoseBody
-from csac_jax.deploy.record import Recorder, ReportedOutcome
-from csac_jax.errors import DataWarning, SettingsError, ViewError
+from csac_jax.deploy.record import Image, Recorder, ReportedOutcome
+from csac_jax.errors import DataWarning, SettingsError, ViewError, first_fault
 from csac_jax.runtime import provenance
+from csac_jax.section import require
 
 LARGEST_BODY = 16 * 2**20  # bytes: two images of 1280 x 720 px take a third
 MOST_DISCARDED = 8 * LARGEST_BODY
 SLOWEST_BODY = 30.0  # s, to send one
-OPEN = "/health"  # the path that needs no token
-_PNG = struct.Struct(">8s4x4sII")  # signature, first chunk, width, height
-
-Message = dict[str, Any]
-Receive = Callable[[], Awaitable[Message]]
-Send = Callable[[Any], Awaitable[None]]
+STATUS: dict[type[Exception], int] = {
+    SettingsError: 400,
+    ClientDisconnect: 400,
+    FileNotFoundError: 404,
+    ViewError: 422,
+    pydantic.ValidationError: 422,
+    OSError: 507,
+}
+_PNG, _PNG_START = struct.Struct(">16sII"), b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+"""The start of a PNG: signature, length and name of the first chunk; then width and height."""
 
 
 class DecideRequest(pydantic.BaseModel, extra="forbid"):
@@ -62,68 +67,32 @@ class OutcomeRequest(ReportedOutcome, frozen=True):
     id: str
 
 
-class AuthMiddleware:
-    """Middleware that asks for the token and refuses bodies that are too large or too slow."""
-
-    def __init__(self, app: Any, token: str | None) -> None:
-        self._app, self._token = app, token
-
-    async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        headers = {name.lower(): value for name, value in scope["headers"]}
-        if scope["path"] != OPEN and not self._knows(headers.get(b"authorization", b"")):
-            await _refuse(scope, receive, send, 401, "send the header Authorization: Bearer TOKEN")
-            return
-        try:
-            async with asyncio.timeout(SLOWEST_BODY):
-                body = await _body(receive)
-        except TimeoutError:
-            await _refuse(
-                scope, receive, send, 408, f"the body took more than {SLOWEST_BODY:.0f} s"
-            )
-            return
-        if body is None:
-            text = f"the body is larger than {LARGEST_BODY >> 20} MiB; send smaller images"
-            await _refuse(scope, receive, send, 413, text)
-            return
-        await self._app(scope, _replay(body, receive), send)
-
-    def _knows(self, authorisation: bytes) -> bool:
-        wanted = f"Bearer {self._token}".encode()
-        return self._token is None or secrets.compare_digest(authorisation, wanted)
-
-
-async def _body(receive: Receive) -> bytes | None:
-    """Reads the whole body; returns None if it is larger than LARGEST_BODY.
+async def read_body(request: Request) -> bytes:
+    """Reads the whole body; refuses one that is too large or too slow.
 
     Of a larger body up to MOST_DISCARDED is read: a client that still sends sees no answer.
     """
-    body, more, size = bytearray(), True, 0
-    while more and size <= MOST_DISCARDED:
-        message = await receive()
-        piece = message.get("body", b"")
-        more, size = message.get("more_body", False), size + len(piece)
-        body += piece if size <= LARGEST_BODY else b""
-    return bytes(body) if size <= LARGEST_BODY else None
+    body, size = bytearray(), 0
+    try:
+        async with asyncio.timeout(SLOWEST_BODY):
+            async for piece in request.stream():
+                size += len(piece)
+                body += piece if size <= LARGEST_BODY else b""
+                if size > MOST_DISCARDED:
+                    break
+    except TimeoutError:
+        raise _refused(408, f"the body took more than {SLOWEST_BODY:.0f} s") from None
+    if size > LARGEST_BODY:
+        text = f"the body is larger than {LARGEST_BODY >> 20} MiB; send smaller images"
+        raise _refused(413, text)
+    return bytes(body)
 
 
-def _replay(body: bytes, receive: Receive) -> Receive:
-    """Returns the body once, then the connection's messages."""
-    waiting = [body]
-
-    async def first() -> Message:
-        if waiting:
-            return {"type": "http.request", "body": waiting.pop(), "more_body": False}
-        return await receive()
-
-    return first
+def _refused(status: int, text: str) -> HTTPException:
+    return HTTPException(status, text, {"connection": "close"})  # the rest of the body is not read
 
 
-async def _refuse(scope: Message, receive: Receive, send: Send, status: int, text: str) -> None:
-    headers = {"connection": "close"}  # the rest of the body is not read
-    await JSONResponse({"detail": text}, status, headers)(scope, receive, send)
+Body = Annotated[bytes, Depends(read_body)]
 
 
 def make(
@@ -133,26 +102,31 @@ def make(
 
     /version names the `source`. A `recorder` stores images, decisions and outcomes.
     """
-    app, turn = fastapi.FastAPI(openapi_url=None), threading.Lock()
-    app.add_exception_handler(SettingsError, lambda _, error: _one_line(400, error))
-    app.add_exception_handler(ViewError, lambda _, error: _one_line(422, error))
-    app.add_exception_handler(RequestValidationError, lambda _, error: _invalid(error))
-    app.add_exception_handler(FileNotFoundError, lambda _, error: _one_line(404, error))
-    app.add_exception_handler(OSError, lambda _, error: _one_line(507, error))
 
-    @app.get(OPEN)
+    def check_token(request: Request) -> None:
+        sent, wanted = request.headers.get("authorization", ""), f"Bearer {token}"
+        if token is not None and not secrets.compare_digest(sent.encode(), wanted.encode()):
+            raise _refused(401, "send the header Authorization: Bearer TOKEN")
+
+    app, turn = fastapi.FastAPI(openapi_url=None), threading.Lock()
+    for kind, status in STATUS.items():
+        app.add_exception_handler(kind, functools.partial(_one_line, status))
+    router = fastapi.APIRouter(dependencies=[Depends(check_token)])
+
+    @app.get("/health")
     def health() -> dict[str, str]:
         return {"status": "ok"}
 
-    @app.get("/version")
+    @router.get("/version")
     def version() -> dict[str, Any]:
         extent, task = policy.cfg.heightmap.extent, policy.cfg.task.kind
         about = {"policy": source, "task": task, "extent": extent}
         return {**about, "versions": provenance.versions()}
 
-    @app.post("/decide")
-    def decide(request: DecideRequest) -> dict[str, Any]:
-        image = _arrays(request)
+    @router.post("/decide")
+    def decide(body: Body) -> dict[str, Any]:
+        request = DecideRequest.model_validate_json(body)
+        image = _image(request)
         with turn, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", DataWarning)
             begun = time.perf_counter()
@@ -166,46 +140,38 @@ def make(
             "milliseconds": round(1e3 * seconds, 1),
         }
 
-    @app.post("/outcome")
-    def post_outcome(request: OutcomeRequest) -> dict[str, Any]:
+    @router.post("/outcome")
+    def post_outcome(body: Body) -> dict[str, Any]:
         if recorder is None:
             raise FileNotFoundError("the service records nothing; start it with a record")
-        outcome = ReportedOutcome(**request.model_dump(exclude={"id"}))
+        request = OutcomeRequest.model_validate_json(body)
         with turn:
-            recorder.post(request.id, outcome)
+            recorder.post(request.id, ReportedOutcome(**request.model_dump(exclude={"id"})))
         return {"id": request.id}
 
-    return AuthMiddleware(app, token)
+    app.include_router(router)
+    return app
 
 
-def _one_line(status: int, error: Exception) -> JSONResponse:
-    return JSONResponse({"detail": " ".join(str(error).split())}, status)
+def _one_line(status: int, _: Request, error: Exception) -> JSONResponse:
+    text = first_fault(error) if isinstance(error, pydantic.ValidationError) else str(error)
+    return JSONResponse({"detail": " ".join(text.split())}, status)
 
 
-def _invalid(error: Any) -> JSONResponse:
-    """Returns the first fault of a body, without the body."""
-    first = error.errors()[0]
-    place = ".".join(map(str, first["loc"][:4]))
-    return JSONResponse({"detail": f"{place}: {first['msg'][:200]}"}, 422)
-
-
-def _arrays(request: DecideRequest) -> tuple[Any, Any, Any, Any, Any]:
-    """Decodes the arguments of `CameraPolicy.decide` but `top`."""
-    rgb, depth = _pixels(request.rgb, "rgb"), _pixels(request.depth, "depth")
+def _image(request: DecideRequest) -> Image:
+    rgb, depth = _pixels(request.rgb, "rgb"), image_files.metres(_pixels(request.depth, "depth"))
     mask = None if request.mask is None else _pixels(request.mask, "mask")
-    metres = image_files.metres(depth, "depth")
-    return rgb, metres, request.intrinsics, request.pose.matrix, mask
+    return rgb, depth, request.intrinsics, request.pose.matrix, mask
 
 
 def _pixels(text: str, name: str) -> np.ndarray:
     """Decodes a PNG in base64. Raises SettingsError for anything else, and for one too large."""
     try:
         content = base64.b64decode(text, validate=True)
-        signature, kind, width, height = _PNG.unpack_from(content)
-    except (binascii.Error, ValueError, struct.error):
-        raise SettingsError(f"{name}: must be a PNG in base64") from None
-    if signature != b"\x89PNG\r\n\x1a\n" or kind != b"IHDR":
-        raise SettingsError(f"{name}: must be a PNG in base64")
-    if max(width, height) > images.MOST_PIXELS:
-        raise SettingsError(f"{name}: at most {images.MOST_PIXELS} px a side")
+        start, width, height = _PNG.unpack_from(content)
+    except (ValueError, struct.error):
+        start, width, height = b"", 0, 0
+    require(start == _PNG_START, f"{name}: must be a PNG in base64")
+    fits = max(width, height) <= images.MOST_PIXELS
+    require(fits, f"{name}: at most {images.MOST_PIXELS} px a side")
     return image_files.decode(content)

@@ -53,10 +53,8 @@ def from_image(
 ) -> tuple[Callable[..., Outputs], tuple[Any, ...]]:
     """Returns the policy as a function of an image, and the shapes of its arguments.
 
-    It does not check that the image fits the pose, as `CameraPolicy.decide` does.
-    Args: size, width and height of the image, px.
+    It does not check that the image fits the pose. Args: size, width and height of the image, px.
     """
-    rows = size[::-1]
 
     def decide(
         rgb: jax.Array, depth: jax.Array, lens: jax.Array, pose: jax.Array, *mask: jax.Array
@@ -66,13 +64,9 @@ def from_image(
         colour, valid = rgb.reshape(-1, 3), depth_camera.supported(depth, lens[0]).reshape(-1)
         return _outputs(cfg, params, decision_program.observe(cfg, points, valid, colour, marked))
 
-    shapes = (
-        _ARRAY((*rows, 3), np.uint8),
-        _ARRAY(rows, np.float32),
-        _ARRAY((4,), np.float32),
-        _ARRAY((4, 4), np.float32),
-        _ARRAY(rows, np.bool_),
-    )
+    rows = size[::-1]
+    floats = [_ARRAY(shape, np.float32) for shape in (rows, (4,), (4, 4))]
+    shapes = _ARRAY((*rows, 3), np.uint8), *floats, _ARRAY(rows, np.bool_)
     return decide, shapes if cfg.task.kind == "target" else shapes[:4]
 
 
@@ -93,8 +87,6 @@ def _outputs(cfg: Config, params: Params, obs: Observation) -> Outputs:
 
 
 def serialize(decide: Callable[..., Outputs], shapes: tuple[Any, ...]) -> bytes:
-    """Writes a function in JAX's portable format, for the kind of device that JAX has here.
-
-    `jax.export.deserialize(bytearray(content)).call(*arrays)` runs it.
-    """
+    """Writes a function for the kind of device that JAX has here; `jax.export.deserialize` reads
+    it."""
     return bytes(jax.export.export(jax.jit(decide))(*shapes).serialize())

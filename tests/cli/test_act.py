@@ -1,4 +1,7 @@
-"""`csac-jax act`: files in, decisions out as text, JSON and picture; bad files are one line."""
+"""`csac-jax act`: files in, decisions out as text, JSON and picture; bad files are one line.
+
+And the bad options of the other commands at a robot.
+"""
 
 import json
 import re
@@ -13,6 +16,7 @@ import pytest
 from csac_jax import cli
 from csac_jax.config import CameraConfig
 from csac_jax.deploy import CameraPolicy
+from csac_jax.deploy.image_files import encode
 from tests.deploy import image_files, scenes
 
 POSES = np.array([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])
@@ -27,7 +31,8 @@ def given(tmp_path: Path) -> list[str]:
 
 
 def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: the command prints and writes what `CameraPolicy.decide` returns, and draws it."""
+    """Claim: the command prints and writes what `CameraPolicy.decide` returns, and draws it. An
+    empty table is no failure: no decision, and a picture that says so."""
     files = ["--json", str(tmp_path / "out.json"), "--png", str(tmp_path / "out.png")]
     assert cli.main(["act", *given, "--top", "2", *files]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -38,19 +43,13 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
         assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line
         np.testing.assert_allclose(found["position"], decision.position, atol=1e-4)
         assert found["primitive"] == decision.primitive
-        assert [w["name"] for w in found["waypoints"]] == ["approach", "descend", "act", "retreat"]
     assert {"device", "versions", "commit", "config"} <= set(result)
     assert imageio.imread(tmp_path / "out.png").shape == (640, 1248, 3)
-
-
-def test_depth_in_metres(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: an .npy of metres does as a PNG of millimetres, to the millimetre's rounding."""
-    lines = []
-    for name in ("depth.png", "depth.npy"):
-        assert cli.main(["act", *given, "--depth", str(tmp_path / name)]) == 0
-        lines.append(capsys.readouterr().out)
-    x, y = (np.array(re.findall(r"[xy] ([-+.\d]+)", line), float) for line in lines)
-    np.testing.assert_allclose(x, y, atol=0.02)
+    (tmp_path / "out.png").unlink()
+    empty = image_files.write(tmp_path / "empty", EMPTY)
+    assert cli.main(["act", "shipped", *empty, *files[2:]]) == 0
+    assert capsys.readouterr().out == "nothing to act on\n"
+    assert (tmp_path / "out.png").stat().st_size > 10_000
 
 
 def test_mask_and_workspace(given: list[str], tmp_path: Path):
@@ -74,8 +73,8 @@ def test_mask_and_workspace(given: list[str], tmp_path: Path):
 
 
 def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: --record keeps an image whose files are those of the command: it decides on them as
-    before. Images that are refused are not kept."""
+    """Claim: --record keeps an image whose files are those of the command, depth as an .npy of
+    metres: it decides on them as before. Images that are refused are not kept."""
     record, out = tmp_path / "record", tmp_path / "out.json"
     assert cli.main(["act", *given, "--record", str(record), "--json", str(out)]) == 0
     first, line = capsys.readouterr().out.splitlines()
@@ -86,26 +85,26 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     files = [part for path in paths for part in (f"--{path.stem}", str(path))]
     assert cli.main(["act", "shipped", *files]) == 0
     assert capsys.readouterr().out.splitlines() == [first]
-    _ten_times(tmp_path)
+    depth = imageio.imread(tmp_path / "depth.png")
+    imageio.imwrite(tmp_path / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
     assert cli.main(["act", *given, "--record", str(record)]) == 1
-    assert "counts in 0.1 mm; multiply it by 0.1" in capsys.readouterr().err
+    assert "multiply it by 0.1" in capsys.readouterr().err
     assert sorted(path.name for path in record.iterdir()) == ["000001", "record.json"]
 
 
 def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: --check accepts a right pose; it refuses one that is 2 cm off, a table with blocks,
     and a camera that sees too little, each by one line."""
-    cases = {"fit": (EMPTY, 0, "pose and intrinsics fit")}
-    pose = EMPTY.pose.copy()
-    pose[2, 3] += 0.02
-    cases["low"] = (EMPTY._replace(pose=pose), 1, "the table is not at z = 0")
-    cases["full"] = (IMAGE, 1, "the table is not empty")
+    low = EMPTY.pose + np.diag([0, 0, 0.02], 1)
     aside = CameraConfig(focal=(900.0, 900.0), look_at=(0.0, 0.15, 0.0))
     beside = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]), aside)
-    cases["aside"] = (beside, 1, "too little of the workspace is seen")
-    for name, (image, code, line) in cases.items():
-        options = image_files.write(tmp_path / name, image)
-        json_file = tmp_path / f"{name}.json"
+    for image, code, line in (
+        (EMPTY, 0, "pose and intrinsics fit"),
+        (EMPTY._replace(pose=low), 1, "the table is not at z = 0"),
+        (IMAGE, 1, "the table is not empty"),
+        (beside, 1, "too little of the workspace is seen"),
+    ):
+        options, json_file = image_files.write(tmp_path, image), tmp_path / "report.json"
         assert cli.main(["act", "shipped", *options, "--check", "--json", str(json_file)]) == code
         captured = capsys.readouterr()
         assert line in captured.out + captured.err
@@ -113,20 +112,15 @@ def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture)
         assert bool(json.loads(json_file.read_text())["faults"]) == bool(code)
 
 
-def _ten_times(folder: Path) -> None:
-    depth = imageio.imread(folder / "depth.png")
-    imageio.imwrite(folder / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
-
-
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
         ("rgb.png", None, "there is no file"),
         ("rgb.png", b"\x89PNG\r\n\x1a\n" + b"1" * 2000, "rgb.png: "),
-        ("rgb.png", image_files.png(IMAGE.rgb[::2, ::2]), "rgb 320 x 240, depth 640 x 480"),
-        ("depth.png", image_files.png(IMAGE.rgb[..., 0]), "depth.png: is uint8; give a PNG of 16"),
+        ("rgb.png", encode(IMAGE.rgb[::2, ::2]), "rgb 320 x 240, depth 640 x 480"),
+        ("depth.png", encode(IMAGE.rgb[..., 0]), "depth.png: depth: is uint8; give a PNG"),
         ("pose.json", b"1 0 0 0", "pose.json: Invalid JSON"),
-        ("pose.json", b'{"matrix": [[1, 2], [3]]}', "matrix: must be a 4 x 4 matrix of numbers"),
+        ("pose.json", b'{"matrix": [[1, 2], [3]]}', "pose.json: matrix: must be a 4 x 4 matrix"),
         ("intrinsics.json", b'{"width": 640}', "intrinsics.json: intrinsics: 'height' is missing"),
     ],
 )
@@ -138,7 +132,8 @@ def test_bad_files_are_one_line(
     content: bytes | None,
     message: str,
 ):
-    """Claim: what is wrong with a file is one line that names it."""
+    """Claim: what is wrong with a file is one line that names it. An unknown policy has exit code
+    1."""
     (tmp_path / file).unlink()
     if content is not None:
         (tmp_path / file).write_bytes(content)
@@ -147,33 +142,62 @@ def test_bad_files_are_one_line(
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert message in captured.err
+    assert cli.main(["act", "nowhere", *given[1:]]) == 1
+    assert "there is no folder nowhere" in capsys.readouterr().err
+
+
+EXTRAS = {"calibrate": "cv2", "serve": "uvicorn", "export": "jax2onnx"}
+LENS = "--rgb a.png --intrinsics c.json"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--top", "0"], "top: must lie in 1 .. 64, not 0"),
-        (["--png", "out.bmp"], "its name must end in one of: .png"),
-        (["--check", "--record", "r"], "--record: --check decides nothing"),
-        (["--record", "."], "is no record: it has no record.json"),
+        ("act shipped {} --top 0", "top: must lie in 1 .. 64, not 0"),
+        ("act shipped {} --png out.bmp", "its name must end in one of: .png"),
+        ("act shipped {} --check --record r", "--record: --check decides nothing"),
+        ("act shipped {} --record .", "is no record: it has no record.json"),
+        ("serve shipped --host 0.0.0.0", "give --token-file too"),
+        ("serve shipped --token-file nowhere", "--token-file: there is no file nowhere"),
+        ("serve shipped --token-file rgb.png", "must have 16 printable characters or more"),
+        ("serve shipped --port 70000", "--port: "),
+        ("serve shipped --size 8 8", "--size: "),
+        ("finetune shipped nowhere", "nowhere is no record: it has no record.json"),
+        ("finetune shipped nowhere --out new.bin", "--out: new.bin must end in .safetensors"),
+        ("finetune shipped nowhere --updates 0", "--updates: "),
+        ("finetune shipped nowhere --batch 0", "--batch: "),
+        ("finetune shipped nowhere --learning-rate 0", "--learning-rate: "),
+        ("finetune shipped nowhere --seed -1", "--seed: "),
+        ("export shipped p.safetensors --average shipped_target", "has critic.params."),
+        ("export shipped p.onnx", "p.onnx: the name must end in .safetensors, see --format"),
+        ("export shipped p.onnx --format onnx --input image", "needs --format stablehlo"),
+        ("export shipped p.stablehlo --format stablehlo --size 8 8", "--size: "),
+        ("calibrate", "calibrate: give --rgb and --intrinsics, or --board FILE to print"),
+        ("calibrate --board board.pdf", "--board: board.pdf must end in .png"),
+        (f"calibrate {LENS} --rgb a.png b.png", "--rgb: one image of a board on the table"),
+        (f"calibrate {LENS} --robot d.json", "--robot and --workspace go together"),
+        (f"calibrate {LENS}", "there is no file c.json"),
+        (f"calibrate {LENS} --square 30", "the side of a square in m"),
     ],
 )
 def test_bad_options(
-    given: list[str], capsys: pytest.CaptureFixture, arguments: list[str], message: str
+    given: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: str,
+    message: str,
 ):
-    """Claim: options out of range are refused with exit code 2, an unknown policy with 1."""
-    assert cli.main(["act", *given, *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert cli.main(["act", "nowhere", *given[1:]]) == 1
-    assert "there is no folder nowhere" in capsys.readouterr().err
-
-
-def test_nothing_to_act_on(tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: an empty table is no failure: no decision, and a picture that says so."""
-    options = image_files.write(tmp_path, EMPTY)
-    assert cli.main(["act", "shipped", *options, "--png", str(tmp_path / "o.png")]) == 0
-    assert capsys.readouterr().out == "nothing to act on\n"
-    assert (tmp_path / "o.png").stat().st_size > 10_000
+    """Claim: what a command cannot do, or not safely, is refused with exit code 2 and one line that
+    names the option, and nothing is written."""
+    pytest.importorskip(EXTRAS.get(arguments.split()[0], "csac_jax"))
+    monkeypatch.chdir(tmp_path)
+    files = sorted(tmp_path.iterdir())
+    assert cli.main(arguments.format(" ".join(given[1:])).split()) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == files
 
 
 def test_command_needs_no_mujoco(given: list[str], tmp_path: Path):

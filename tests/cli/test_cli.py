@@ -108,7 +108,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("eval shipped --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_"),
         ("eval shipped --suite nowhere", "'nowhere' is neither a case file nor one of: in_distr"),
         ("play --heightmap.size 60", "heightmap.size: must be a multiple of 8"),
-        ("export . policy.bin", "policy.bin: the name of a policy file ends in .safetensors"),
+        ("export . policy.bin", "policy.bin: the name must end in .safetensors"),
         ("doctor --preset", "--preset: a value is missing"),
         ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),

@@ -1,5 +1,7 @@
 """Images of a printed board at poses that are known, by our own rays."""
 
+import dataclasses
+
 import numpy as np
 from scipy import ndimage
 
@@ -8,9 +10,7 @@ from csac_jax.deploy.board import DPI, Board
 
 INCH = 0.0254  # m
 LENS = images.Intrinsics(640, 480, 615.0, 612.0, 322.0, 241.0)
-DISTORTED = images.Intrinsics(
-    640, 480, 615.0, 612.0, 322.0, 241.0, (-0.35, 0.1, 0.002, -0.004, 0.0)
-)
+DISTORTED = dataclasses.replace(LENS, distortion=(-0.35, 0.1, 0.002, -0.004, 0.0))
 FINE = 2  # rays along each side of a pixel
 
 

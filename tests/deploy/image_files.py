@@ -1,6 +1,5 @@
 """An image as the files that `csac-jax act` reads."""
 
-import io
 import json
 from pathlib import Path
 
@@ -8,13 +7,6 @@ import imageio.v2 as imageio
 import numpy as np
 
 from tests.deploy.scenes import Image
-
-
-def png(pixels: np.ndarray) -> bytes:
-    """Encodes an image."""
-    buffer = io.BytesIO()
-    imageio.imwrite(buffer, pixels, format="png")
-    return buffer.getvalue()
 
 
 def rounded(image: Image) -> Image:
@@ -26,12 +18,11 @@ def rounded(image: Image) -> Image:
 def write(folder: Path, image: Image) -> list[str]:
     """Writes the files; returns the options that name them."""
     folder.mkdir(parents=True, exist_ok=True)
+    depth = rounded(image).depth
     imageio.imwrite(folder / "rgb.png", image.rgb)
-    millimetres = np.round(1000 * rounded(image).depth).astype(np.uint16)
-    imageio.imwrite(folder / "depth.png", millimetres)
-    np.save(folder / "depth.npy", rounded(image).depth)
+    imageio.imwrite(folder / "depth.png", np.round(1000 * depth).astype(np.uint16))
+    np.save(folder / "depth.npy", depth)
     (folder / "intrinsics.json").write_text(json.dumps(image.intrinsics))
     (folder / "pose.json").write_text(json.dumps({"matrix": image.pose.tolist()}))
-    files = {"rgb": "rgb.png", "depth": "depth.png"}
-    files |= {name: f"{name}.json" for name in ("intrinsics", "pose")}
-    return [part for name, file in files.items() for part in (f"--{name}", str(folder / file))]
+    files = ("rgb.png", "depth.png", "intrinsics.json", "pose.json")
+    return [part for name in files for part in (f"--{name.split('.')[0]}", str(folder / name))]

@@ -39,7 +39,7 @@ def test_points_project_to_their_pixels(lens: tuple[float, ...]):
     camera = Intrinsics(**IDEAL, distortion=lens)
     depth = np.random.default_rng(0).uniform(0.3, 2.0, camera.shape).astype(np.float32)
     view = images.make(RGB, depth, camera, POSE)
-    pixel, inside = view.project(view.points.reshape(-1, 3))
+    pixel, inside = images.project(view.intrinsics, view.pose, view.points.reshape(-1, 3))
     u, v = np.meshgrid(np.arange(64), np.arange(48))
     assert inside.all()
     np.testing.assert_allclose(pixel, np.stack([u, v], -1).reshape(-1, 2), atol=2e-3)
@@ -66,15 +66,10 @@ def test_missing_depth_is_missing():
     assert np.isfinite(view.points).all()
 
 
-def _given(**changes: Any) -> dict[str, Any]:
-    given = {"rgb": RGB, "depth": DEPTH, "intrinsics": IDEAL, "camera_pose": POSE}
-    return given | changes
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rgb": RGB / 255.0}, "rgb: is float64; give rgb * 255 as uint8"),
+        ({"rgb": RGB / 255.0}, "rgb: is float64; give 0 to 255 as uint8"),
         ({"rgb": np.zeros((48, 64, 4), np.uint8)}, "leave out its alpha: rgb[..., :3]"),
         ({"depth": (1000 * DEPTH).astype(np.uint16)}, "depth * 0.001 for millimetres"),
         ({"depth": DEPTH[..., None]}, "depth: must have shape [rows, columns], not [48, 64, 1]"),
@@ -87,14 +82,11 @@ def _given(**changes: Any) -> dict[str, Any]:
         ({"intrinsics": {**IDEAL, "fx": "600"}}, "'fx' should be a valid number"),
         ({"intrinsics": {**IDEAL, "fy": np.nan}}, "'fy' should be a finite number"),
         ({"intrinsics": {**IDEAL, "cx": 500.0}}, "cx and cy must lie in the image"),
-        (
-            {"intrinsics": {**IDEAL, "width": 0}},
-            "intrinsics: 'width' should be greater than or equal to 16",
-        ),
+        ({"intrinsics": {**IDEAL, "width": 0}}, "'width' should be greater than or equal to 16"),
         ({"intrinsics": {**IDEAL, "distortion": [0.1, 0.2]}}, "4 or 5 numbers, k1 k2 p1 p2 k3"),
         ({"intrinsics": {**IDEAL, "distortion": [-4.0, 0, 0, 0]}}, "has no inverse over the image"),
         ({"camera_pose": POSE[:3]}, "camera_pose: must be a 4 x 4 matrix"),
-        ({"camera_pose": "pose"}, "camera_pose: must be a 4 x 4 matrix of numbers"),
+        ({"camera_pose": "pose"}, "camera_pose: must be a 4 x 4 matrix of finite numbers"),
         ({"camera_pose": POSE.T}, "it may be transposed, scaled or mirrored"),
         ({"camera_pose": POSE @ np.diag([1, 1, -1, 1])}, "transposed, scaled or mirrored"),
         ({"camera_pose": POSE * np.nan}, "must be a 4 x 4 matrix of finite numbers"),
@@ -102,6 +94,7 @@ def _given(**changes: Any) -> dict[str, Any]:
 )
 def test_wrong_form_is_refused(changes: dict[str, Any], message: str):
     """Claim: arrays of a wrong form give one line that says what to change."""
+    sound = {"rgb": RGB, "depth": DEPTH, "intrinsics": IDEAL, "camera_pose": POSE}
     with pytest.raises(SettingsError, match=re.escape(message)) as caught:
-        images.make(**_given(**changes)).points  # noqa: B018, the rays are made here
+        images.make(**(sound | changes)).points  # noqa: B018, the rays are made here
     assert "\n" not in str(caught.value)

@@ -24,7 +24,13 @@ WORKSPACE = np.array([[0, -1, 0, 0.4], [1, 0, 0, -0.2], [0, 0, 1, 0.05], [0, 0, 
 
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
-    return csac_jax.deploy.CameraPolicy.load("shipped", WORKSPACE)
+    return CameraPolicy.load("shipped", WORKSPACE)
+
+
+def _untrained(**sections: Any) -> CameraPolicy:
+    cfg = presets.smoke().change(**sections)
+    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), actor_critic.make(cfg)).online)()
+    return CameraPolicy(cfg, params)
 
 
 @pytest.fixture(scope="module")
@@ -88,22 +94,15 @@ def test_flying_pixels_are_left_out(policy: CameraPolicy):
 
 
 def test_waypoints_are_a_grasp(decisions: list[Decision]):
-    """Claim: the tool goes straight down with open fingers, closes, and goes up again, 10 cm."""
-    approach, descend, act, retreat = decisions[0].waypoints
-    names = [waypoint.name for waypoint in decisions[0].waypoints]
-    assert names == ["approach", "descend", "act", "retreat"]
-    for waypoint in decisions[0].waypoints:
-        assert waypoint.position[:2] == approach.position[:2]
-        assert waypoint.yaw == approach.yaw
-    heights = [waypoint.position[2] for waypoint in decisions[0].waypoints]
+    """Claim: the tool goes straight down with open fingers, closes, and goes up again, 10 cm. Its
+    pose is the workspace's pose times the place: z down, x along the yaw."""
+    names, places, yaws, openings, _ = zip(*decisions[0].waypoints, strict=True)
+    assert names == ("approach", "descend", "act", "retreat")
+    assert len(set(yaws)) == len({place[:2] for place in places}) == 1
     low = decisions[0].position[2]
+    heights = [place[2] for place in places]
     np.testing.assert_allclose(heights, [low + 0.1, low, low, low + 0.1], atol=1e-5)
-    openings = [waypoint.opening for waypoint in (approach, descend, act, retreat)]
     np.testing.assert_allclose(openings, [0.11, 0.11, 0.0, 0.0], atol=1e-6)
-
-
-def test_tool_is_in_the_robot_s_frame(decisions: list[Decision]):
-    """Claim: a tool's pose is the workspace's pose times the place: z down, x along the yaw."""
     for waypoint in decisions[0].waypoints:
         tool, (x, y, z) = np.array(waypoint.tool), waypoint.position
         np.testing.assert_allclose(tool[:3, 3], [0.4 - y, -0.2 + x, 0.05 + z], atol=1e-6)
@@ -140,12 +139,10 @@ def test_target_is_grasped(policy: CameraPolicy, number: int):
 
 def test_policy_of_the_target_task_needs_a_mask():
     """Claim: a policy that was trained to get one block asks for its mask."""
-    cfg = presets.smoke().change(task={"kind": "target"})
-    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), actor_critic.make(cfg)).online)()
+    policy = _untrained(task={"kind": "target"})
     with pytest.raises(SettingsError, match="target_mask: this policy gets a marked object"):
-        CameraPolicy(cfg, params).decide(*IMAGE)
-    mask = np.asarray(IMAGE.depth > 0)
-    assert CameraPolicy(cfg, params).decide(*IMAGE, target_mask=mask)
+        policy.decide(*IMAGE)
+    assert policy.decide(*IMAGE, target_mask=np.asarray(IMAGE.depth > 0))
 
 
 def test_misfit_is_refused(policy: CameraPolicy):
@@ -173,10 +170,7 @@ def test_report_of_the_empty_table(policy: CameraPolicy):
 
 def test_net_of_heights_sees_no_colours():
     """Claim: a policy with `net.colour` off decides the same whatever the colours are."""
-    cfg = presets.smoke().change(net={"colour": False})
-    learner = actor_critic.make(cfg)
-    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner).online)()
-    heights = CameraPolicy(cfg, params)
+    heights = _untrained(net={"colour": False})
     other = IMAGE._replace(rgb=np.roll(255 - IMAGE.rgb, 7, axis=1))
     first, second = (heights.decide(*image)[0].to_dict() for image in (IMAGE, other))
     assert first == second

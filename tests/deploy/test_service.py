@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from csac_jax.cli import main
 from csac_jax.deploy import CameraPolicy, record
+from csac_jax.deploy.image_files import encode
 from csac_jax.deploy.record import Recorder
 from tests.deploy import image_files, scenes
 
@@ -31,13 +31,15 @@ IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.
 CLIENTS = 50
 
 
-def _png(array: np.ndarray) -> str:
-    return base64.b64encode(image_files.png(array)).decode()
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode()
 
 
+PNG = encode(IMAGE.rgb)
+HUGE = PNG[:16] + (60000).to_bytes(4, "big") * 2 + PNG[24:]  # px, by its header
 BODY: dict[str, Any] = {
-    "rgb": _png(IMAGE.rgb),
-    "depth": _png(np.round(1000 * IMAGE.depth).astype(np.uint16)),
+    "rgb": _base64(PNG),
+    "depth": _base64(encode(np.round(1000 * IMAGE.depth).astype(np.uint16))),
     "intrinsics": IMAGE.intrinsics,
     "pose": {"matrix": IMAGE.pose.tolist()},
 }
@@ -47,9 +49,8 @@ class Server:
     """A service in a thread."""
 
     def __init__(self, app: Any) -> None:
-        self._server = uvicorn.Server(
-            uvicorn.Config(app, port=0, log_level="error", lifespan="off")
-        )
+        config = uvicorn.Config(app, port=0, log_level="error", lifespan="off")
+        self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
         while not self._server.started:
@@ -70,10 +71,6 @@ class Server:
     def stop(self) -> None:
         self._server.should_exit = True
         self._thread.join(10)
-
-
-SOUND = base64.b64decode(BODY["rgb"])
-HUGE = SOUND[:16] + (60000).to_bytes(4, "big") * 2 + SOUND[24:]  # px, by its header
 
 
 @pytest.fixture(scope="module")
@@ -104,29 +101,29 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
     mask = np.zeros((480, 640), np.uint8)
     mask[:, 320:] = 255
     _, first = recording.ask("POST", "/decide", {**BODY, "top": 2})
-    _, second = recording.ask("POST", "/decide", {**BODY, "mask": _png(mask)})
+    marked = {**BODY, "mask": _base64(encode(mask))}
+    _, second = recording.ask("POST", "/decide", marked)
     assert [first["id"], second["id"]] == ["000001", "000002"]
     assert second["decisions"][0]["position"][1] < -0.03  # the block at y = -0.09
-    said = {"id": "000001", "outcome": "dropped", "number": 2, "ended": True}
-    assert recording.ask("POST", "/outcome", said) == (200, {"id": "000001"})
+    outcome = {"id": "000001", "outcome": "dropped", "number": 2, "ended": True}
+    assert recording.ask("POST", "/outcome", outcome) == (200, {"id": "000001"})
     one, two = record.read(tmp_path)
     assert one.outcome == record.ReportedOutcome(outcome="dropped", number=2, ended=True)
     assert two.outcome is None
     assert one.decisions == first["decisions"]
-    for entry, marked in [(one, None), (two, mask > 0)]:
-        rgb, depth, _, pose, found = entry.image
-        np.testing.assert_array_equal(rgb, IMAGE.rgb)
-        np.testing.assert_array_equal(depth, IMAGE.depth)
-        np.testing.assert_array_equal(pose, IMAGE.pose)
-        assert np.array_equal(found, marked) if marked is not None else found is None
+    np.testing.assert_array_equal(two.image[4], mask > 0)
+    for entry in (one, two):
+        for stored, sent in zip(entry.image[:2], IMAGE[:2], strict=True):
+            np.testing.assert_array_equal(stored, sent)
+        np.testing.assert_array_equal(entry.image[3], IMAGE.pose)
 
 
 @pytest.mark.parametrize(
     ("body", "status", "detail"),
     [
         ({"id": "../../etc", "outcome": "lifted"}, 404, "there is no decision ../../etc"),
-        ({"id": "000001", "outcome": "good"}, 422, "body.outcome: Input should be 'nothing'"),
-        ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "body.number: Input should be"),
+        ({"id": "000001", "outcome": "good"}, 422, "'outcome' should be 'nothing'"),
+        ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "'number' should be"),
         ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
     ],
 )
@@ -154,31 +151,21 @@ def test_full_disc_is_told(recording: Server, monkeypatch: pytest.MonkeyPatch):
     assert "No space left on device" in answer["detail"]
 
 
-def test_decides_as_the_library(server: Server):
+def test_decides_as_the_library(server: Server, policy: CameraPolicy):
     """Claim: /decide answers what `CameraPolicy.decide` returns; without a record there is no id,
-    and no outcome is taken."""
+    and no outcome is taken. Colours that seem to be swapped are warned of."""
     status, answer = server.ask("POST", "/decide", {**BODY, "top": 2})
-    wanted = json.loads(
-        json.dumps([d.to_dict() for d in CameraPolicy.load().decide(*IMAGE, top=2)])
-    )
     assert status == 200
-    assert [d["primitive"] for d in answer["decisions"]] == [d["primitive"] for d in wanted]
-    for found, decision in zip(answer["decisions"], wanted, strict=True):
-        np.testing.assert_allclose(found["position"], decision["position"], atol=1e-4)
-    assert answer["warnings"] == []
+    for found, decision in zip(answer["decisions"], policy.decide(*IMAGE, top=2), strict=True):
+        assert found["primitive"] == decision.primitive
+        np.testing.assert_allclose(found["position"], decision.position, atol=1e-4)
+    assert (answer["warnings"], answer["id"]) == ([], None)
     assert answer["milliseconds"] > 0
-    assert answer["id"] is None
     status, answer = server.ask("POST", "/outcome", {"id": "000001", "outcome": "lifted"})
-    assert (status, answer["detail"]) == (
-        404,
-        "the service records nothing; start it with a record",
-    )
-
-
-def test_warning(server: Server):
-    """Claim: colours that seem to be swapped are warned of."""
-    status, answer = server.ask("POST", "/decide", {**BODY, "rgb": _png(IMAGE.rgb[..., ::-1])})
-    assert status == 200
+    assert status == 404
+    assert "the service records nothing" in answer["detail"]
+    swapped = {**BODY, "rgb": _base64(encode(IMAGE.rgb[..., ::-1]))}
+    _, answer = server.ask("POST", "/decide", swapped)
     assert "red and blue seem to be swapped" in answer["warnings"][0]
 
 
@@ -186,8 +173,7 @@ def test_health_and_version(server: Server):
     """Claim: /health needs no token; /version names policy and versions."""
     assert server.ask("GET", "/health", token="") == (200, {"status": "ok"})
     status, answer = server.ask("GET", "/version")
-    assert status == 200
-    assert answer["policy"] == "shipped"
+    assert (status, answer["policy"]) == (200, "shipped")
     assert {"python", "jax", "csac-jax"} <= set(answer["versions"])
 
 
@@ -203,21 +189,21 @@ def test_token_is_asked_for(server: Server, path: str, token: str):
 @pytest.mark.parametrize(
     ("body", "status", "detail"),
     [
-        (b"", 422, "body: "),
-        (b"{", 422, "body.1: JSON decode error"),
-        (b"\xff\xfe\x00", 400, ""),
-        ({}, 422, "body.rgb: Field required"),
-        ({**BODY, "speed": 1}, 422, "body.speed: Extra inputs are not permitted"),
+        (b"", 422, "Invalid JSON"),
+        (b"{", 422, "Invalid JSON"),
+        (b"\xff\xfe\x00", 422, ""),
+        ({}, 422, "'rgb' is missing"),
+        ({**BODY, "speed": 1}, 422, "'speed' is unknown"),
         ({**BODY, "top": 1000}, 400, "top: must lie in 1 .. 64, not 1000"),
         ({**BODY, "rgb": "%%%"}, 400, "rgb: must be a PNG in base64"),
-        ({**BODY, "rgb": base64.b64encode(b"GIF89a" * 9).decode()}, 400, "rgb: must be a PNG"),
-        ({**BODY, "rgb": base64.b64encode(HUGE).decode()}, 400, "rgb: at most 4096 px a side"),
-        ({**BODY, "rgb": base64.b64encode(SOUND[:3000]).decode()}, 400, "the image is damaged"),
+        ({**BODY, "rgb": _base64(b"GIF89a" * 9)}, 400, "rgb: must be a PNG"),
+        ({**BODY, "rgb": _base64(HUGE)}, 400, "rgb: at most 4096 px a side"),
+        ({**BODY, "rgb": _base64(PNG[:3000])}, 400, "the image is damaged"),
         ({**BODY, "depth": BODY["rgb"]}, 400, "depth: is uint8; give a PNG of 16 bits"),
         ({**BODY, "intrinsics": {"fx": 1}}, 400, "intrinsics: 'width' is missing"),
         ({**BODY, "pose": {"matrix": [[1.0]]}}, 400, "camera_pose: must be a 4 x 4 matrix"),
         ({**BODY, "pose": {"matrix": np.eye(4).tolist()}}, 422, "camera_pose: the workspace's cen"),
-        (b'{"rgb": ' + b"[" * 100_000, 400, ""),
+        (b'{"rgb": ' + b"[" * 100_000, 422, ""),
         (b" " * (16 * 2**20 + 1), 413, "the body is larger than 16 MiB"),
     ],
     ids=lambda value: value if isinstance(value, int) else "",
@@ -232,11 +218,12 @@ def test_bad_requests_are_refused(server: Server, body: Any, status: int, detail
     assert server.ask("GET", "/health") == (200, {"status": "ok"})
 
 
-def test_body_without_a_length_is_limited(server: Server):
+@pytest.mark.parametrize("token", [TOKEN, "wrong"])
+def test_body_without_a_length_is_limited(server: Server, token: str):
     """Claim: a chunked body that never ends is cut off."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
     connection.putrequest("POST", "/decide")
-    connection.putheader("Authorization", f"Bearer {TOKEN}")
+    connection.putheader("Authorization", f"Bearer {token}")
     connection.putheader("Transfer-Encoding", "chunked")
     connection.endheaders()
     piece = b"%x\r\n" % 2**20 + b" " * 2**20 + b"\r\n"
@@ -257,23 +244,3 @@ def test_many_clients_lose_nothing(server: Server):
         answers = [future.result() for future in asked]
     assert [status for status, _ in answers] == [200] * CLIENTS
     assert [len(answer["decisions"]) for _, answer in answers] == tops
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--host 0.0.0.0", "give --token-file too"),
-        ("--token-file nowhere", "--token-file: there is no file nowhere"),
-        ("--token-file short", "its first line must have 16 printable characters or more"),
-        ("--port 70000", "--port: "),
-        ("--size 8 8", "--size: "),
-    ],
-)
-def test_bad_options_of_serve(
-    capsys: pytest.CaptureFixture, tmp_path: Any, monkeypatch: Any, arguments: str, message: str
-):
-    """Claim: what cannot be served, or not safely, is refused with exit code 2."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "short").write_text("secret\n")
-    assert main(["serve", "shipped", *arguments.split()]) == 2
-    assert message in capsys.readouterr().err

@@ -37,7 +37,8 @@ def test_grasp_is_drawn_where_it_is():
     image's middle: the camera looks along x."""
     middle = [_coloured(_picture(csac_jax.Action.grasp(0.0, y, 0.0)))[:, 0] for y in (0.1, -0.1)]
     left, right = (np.median(columns) for columns in middle)
-    pixel, _ = VIEW.project(np.array([[0.0, 0.1, 0.015], [0.0, -0.1, 0.015]]))
+    ends = np.array([[0.0, 0.1, 0.015], [0.0, -0.1, 0.015]])
+    pixel, _ = images.project(VIEW.intrinsics, VIEW.pose, ends)
     scale = (right - left) / (pixel[1, 0] - pixel[0, 0])
     assert 1.0 < scale < 1.5  # the image is drawn larger than it is
     assert abs(pixel[0, 0] - 232) < 10
