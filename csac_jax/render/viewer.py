@@ -8,7 +8,7 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -28,13 +28,6 @@ class Pictured(NamedTuple):
     poses: np.ndarray  # [T, ...] qpos
 
 
-class Showing(Protocol):
-    """A window or page that shows poses."""
-
-    def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose; returns False once the view is closed."""
-
-
 def play(
     model: mujoco.MjModel,
     actions: Sequence[Pictured],
@@ -43,21 +36,21 @@ def play(
 ) -> None:
     """Shows an episode, again and again until the window is closed or by Ctrl-C."""
     opened = _window(model) if gl.has_display() else _page(model, log)
-    with contextlib.suppress(KeyboardInterrupt), opened as showing:
+    with contextlib.suppress(KeyboardInterrupt), opened as view:
         for _ in itertools.count() if again else range(1):
             for action in actions:
-                if not _run(model, action, showing):
+                if not _run(model, action, view):
                     return
 
 
-def _run(model: mujoco.MjModel, action: Pictured, showing: Showing) -> bool:
+def _run(model: mujoco.MjModel, action: Pictured, view: "_Window | Page") -> bool:
     """Shows an action in the time that it takes; returns False once the view is closed."""
     data = mujoco.MjData(model)
     for pose in action.poses:
         data.qpos[:] = pose
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        if not showing.show(data, action.text):
+        if not view.show(data, action.text):
             return False
         time.sleep(1.0 / media.FRAMES_PER_SECOND)
     return True
@@ -76,7 +69,7 @@ class _Window:
 
 
 @contextlib.contextmanager
-def _window(model: mujoco.MjModel) -> Iterator[Showing]:
+def _window(model: mujoco.MjModel) -> Iterator[_Window]:
     import mujoco.viewer
 
     data = mujoco.MjData(model)
@@ -97,7 +90,11 @@ class Page:
 
     def __init__(self, server: Any, model: mujoco.MjModel) -> None:
         server.scene.set_up_direction("+z")
-        server.on_client_connect(_look)
+
+        @server.on_client_connect
+        def _(client: Any) -> None:
+            client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
+
         self._text = server.gui.add_markdown("")
         self.parts = {}
         for geom in np.flatnonzero(model.geom_rgba[:, 3] > 0.0):
@@ -108,7 +105,7 @@ class Page:
             )
 
     def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose, see `Showing`; a page never closes."""
+        """Shows the model's pose; True, since a page never closes."""
         if self._text.content != text:
             self._text.content = text
         for geom, part in self.parts.items():
@@ -116,11 +113,6 @@ class Page:
             mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
             part.position, part.wxyz = data.geom_xpos[geom].copy(), turn
         return True
-
-
-def _look(client: Any) -> None:
-    """Sets the first viewpoint of the page."""
-    client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
 
 
 @contextlib.contextmanager

@@ -32,10 +32,7 @@ _CALL_SUBSTEPS = 48  # per call of MuJoCo, ours: a longer call repeats more afte
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
-    """A world in C MuJoCo.
-
-    Raises ValueError for a world without touch sensors, such as one built for MJX.
-    """
+    """A world in C MuJoCo. Raises ValueError for one without touch sensors, as MJX has them."""
 
     world: World
     cfg: SimConfig
@@ -47,7 +44,7 @@ class CPhysics:
 
     @functools.cached_property
     def _key(self) -> str:
-        """Returns a digest of world, settings and MuJoCo; the same in every process."""
+        """Returns a digest of world, settings and MuJoCo, the same in every process."""
         identity = repr((self.world.digest, self.cfg, mujoco.__version__))
         return hashlib.sha256(identity.encode()).hexdigest()
 
@@ -58,7 +55,6 @@ class CPhysics:
 
     @contextlib.contextmanager
     def _simulator(self) -> Iterator["CSimulator"]:
-        """Provides a simulator that no other thread uses, if possible an idle one."""
         try:
             simulator = self._idle.pop()
         except IndexError:
@@ -70,12 +66,12 @@ class CPhysics:
         """Runs one primitive, see `physics.Physics`."""
         fields = model.scene_fields(self.world, scene)
         result = scene, outcome.nothing_seen(len(joints.control), len(self.world.slots))
-        arguments = (scene, fields, joints)
+        run, arguments = self._run_batch, (scene, fields, joints)
         if jax.default_backend() == "cpu" and jax.device_count() == 1:
-            moved, substeps = host_call.call(self._run_batch, self._key, result, *arguments)
+            moved, substeps = host_call.call(run, self._key, result, *arguments)
         else:
             moved, substeps = jax.pure_callback(
-                self._run_batch, result, *arguments, vmap_method="broadcast_all"
+                run, result, *arguments, vmap_method="broadcast_all"
             )
         return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
@@ -85,14 +81,12 @@ class CPhysics:
         axes = batch[-1].reachable.shape
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in np.ndindex(axes)]
         results = self._threads.map(self._run, *zip(*rows, strict=True))
-        return jax.tree.map(
-            lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *results
-        )
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *results)
+        return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[1:]), stacked)
 
     def _run(
         self, scene: SceneState, fields: BlockFields, joints: JointTrajectory
     ) -> tuple[SceneState, Substep]:
-        """Runs one scene. Returns it after the primitive, and its substeps, leaves [T, ...]."""
         world = self.world
         substeps = outcome.nothing_seen(len(joints.control), len(world.slots))
         inputs = scene.position, scene.quaternion, scene.velocity, joints.start, joints.control
@@ -102,18 +96,15 @@ class CPhysics:
         with self._simulator() as simulator:
             qpos, qvel, sensed = _rollout(world, simulator, scene, fields, joints)
         last = qpos[-1].astype(np.float32), qvel[-1].astype(np.float32)
-        touching = sensed.reshape(substeps.touching.shape) > 0.0
-        rise = (qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)
-        gap = world.gripper.gap(qpos[:, world.finger_qpos]).astype(np.float32)
         moved = model_fields.moved(world, scene, *last)
+        touching = sensed.reshape(substeps.touching.shape) > 0.0
+        rise = np.float32(qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2])
+        gap = np.float32(world.gripper.gap(qpos[:, world.finger_qpos]))
         return moved, substeps.replace(touching=touching, rise=rise, gap=gap)
 
 
 class CSimulator:
-    """A MuJoCo model and data that one thread reuses for scene after scene.
-
-    Objects of many parts sleep: at rest they cost nothing until something that moves meets them.
-    """
+    """A MuJoCo model and data that one thread reuses for scenes. Objects at rest sleep."""
 
     def __init__(self, world: World) -> None:
         self.model = copy.copy(world.model)  # holds the blocks of the last scene
@@ -173,13 +164,12 @@ def _rollout(
 def _simulate(
     simulator: CSimulator, state: np.ndarray, control: np.ndarray, speeds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Steps from `state` by `control` [T, ...]; returns MuJoCo's states [T, 1 + nq + nv] and the
-    sensors [T, ...].
+    """Steps by `control` [T, ...]; returns states [T, 1 + nq + nv] and sensors [T, ...].
 
-    `speeds` [..., 6] are the places of block velocities in a state: after every substep they are
-    held to SPEED_LIMIT. MuJoCo's own loop cannot do that, so a call ends with the first substep
-    after which a block is too fast. The next call starts from the limited velocities and the
-    solver's warm start. That gives the bits of one loop, except that sleeping objects may wake.
+    Velocities, at places `speeds` [..., 6] in a state, are held to SPEED_LIMIT after every substep.
+    MuJoCo's own loop cannot do that, so a call ends with the first substep after which a block is
+    too fast. The next one starts from the limited velocities and the solver's warm start. That
+    gives the bits of one loop, except that sleeping objects may wake.
     """
     mj_model, data = simulator.model, simulator.data
     parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(mj_model.nv)

@@ -23,8 +23,7 @@ class Physics(Protocol):
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Moves the robot, one set-point per substep. One scene; callers vmap.
 
-        Blocks that are not in play stay where they are. Blocks that end up in the hand are still
-        in play, hanging where the hand is.
+        Blocks out of play stay where they are. Blocks in the hand at the end are still in play.
         """
 
 
@@ -51,10 +50,7 @@ def make(world: World, cfg: SimConfig) -> Physics:
 
 
 def prepare(physics: Physics, scenes: int) -> None:
-    """Prepares the first action of so many scenes, maybe in another thread.
-
-    Warp builds its kernels for minutes, or loads them, and records its substeps.
-    """
+    """Prepares the first action of so many scenes, for which Warp builds kernels for minutes."""
     if isinstance(physics, warp_physics.WarpPhysics):
         physics.simulator.prepared(scenes)
 
@@ -62,10 +58,8 @@ def prepare(physics: Physics, scenes: int) -> None:
 def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
-    """Runs one primitive. Nothing moves if the robot cannot follow the whole of it.
-
-    Args: height [H, W] m, the map the action was chosen from.
-    """
+    """Runs a primitive chosen from the map `height` [H, W] m. Nothing moves if the robot cannot
+    follow the whole of it."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
@@ -82,7 +76,7 @@ def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
 
 
 def healthy(scene: SceneState) -> jax.Array:
-    """Checks that every entry of a scene lies within its bounds, [] bool.
+    """Returns [] bool, every entry of a scene lies within its bounds.
 
     Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
     """

@@ -17,7 +17,7 @@ LONGEST = 10  # most steps in one recorded graph
 def repeated(step: Callable[[], None], times: int) -> Callable[[], None]:
     """Returns a function that runs `step` so many times, on CUDA as graphs; runs it once here.
 
-    The step must launch and allocate the same whenever it is run.
+    The step must launch and allocate the same in every run.
     """
     _load_kernels(step)  # a recording must not load any
     arrays: list[wp.array] = []

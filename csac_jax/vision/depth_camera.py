@@ -1,13 +1,10 @@
 """Errors of a depth camera on an exact depth image: noise, steps, holes, mixed pixels.
 
 It works in inverse depth, w = 1 / z: a stereo camera's disparity is f b w, and a plane is linear in
-the image. Errors of w that do not depend on w are errors of z that grow with z^2.
-
-Sources:
+the image. Errors of w that do not depend on w are errors of z that grow with z^2. Sources:
 [1] Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth cameras for best performance", Intel: the
     best resolutions; RMS error of depth z^2 subpixel / (f b); 126 disparities are searched.
-[2] Grunnet-Jepsen et al., "Subpixel linearity improvement for Intel RealSense depth cameras":
-    fields of view.
+[2] Grunnet-Jepsen et al., "Subpixel linearity improvement for RealSense depth cameras": views.
 [3] Intel RealSense D400 series data sheet: baselines.
 [4] librealsense, issue 3904: subpixel error of 0.08 px.
 [5] Keselman et al., CVPR workshops 2017, "Intel RealSense stereoscopic depth cameras": 5 bits of
@@ -79,8 +76,7 @@ def measure(
 
     Half of the pixels at edges have no depth. Nor have surfaces that are dark, at a flat angle,
     hidden from the second viewpoint, too near or too far. The returned light is
-    lightness cos(angle). Edges are at least 1 px wide to both sides. Multiple reflections, sunlight
-    and errors that stay from image to image are left out.
+    lightness cos(angle). Multiple reflections, sunlight and lasting errors are left out.
 
     Args: exact [h, w] m along the optical axis; valid [h, w] bool, the ray hit anything; lightness
     [h, w], share of the light that the surface scatters; eye, whose intrinsics count.
@@ -104,18 +100,11 @@ def measure(
 
 
 def supported(depth: jax.Array, focal: Any) -> jax.Array:
-    """Returns [h, w] bool, SUPPORT or more of a pixel's eight neighbours have its depth: a pixel
-    with a depth that does not fly.
-
-    Args: depth [h, w] m, 0 without a depth; focal, px.
-    """
+    """Returns [h, w] bool, a pixel does not fly: SUPPORT or more of its eight neighbours have its
+    depth [h, w] m, 0 without one. `focal` is in px."""
     reach = depth * jnp.maximum(NEAR, 3.0 / focal)
-    padded, size = jnp.pad(depth, 1), depth.shape
-    neighbours = [
-        jax.lax.dynamic_slice(padded, (row, col), size)
-        for row, col in itertools.product(range(3), repeat=2)
-        if (row, col) != (1, 1)
-    ]
+    starts = [start for start in itertools.product(range(3), repeat=2) if start != (1, 1)]
+    neighbours = [jax.lax.dynamic_slice(jnp.pad(depth, 1), at, depth.shape) for at in starts]
     alike = [(jnp.abs(other - depth) < reach).astype(jnp.int32) for other in neighbours]
     return functools.reduce(jnp.add, alike) >= SUPPORT
 
@@ -128,7 +117,7 @@ def _shifted(inverse: jax.Array, radius: int) -> jax.Array:
 
 
 def _bend(inverse: jax.Array, around: jax.Array) -> jax.Array:
-    """Returns the distance of inverse depths [h, w] 1/m from a plane's; 0 on one."""
+    """Returns how far inverse depths [h, w] 1/m are from a plane's; 0 on one."""
     right, left, below, above = around
     along, across = jnp.abs(right + left - 2.0 * inverse), jnp.abs(below + above - 2.0 * inverse)
     return jnp.maximum(along, across)

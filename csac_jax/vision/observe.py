@@ -50,7 +50,10 @@ class Shapes(NamedTuple):
 def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
     """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`."""
     shapes = scene_shapes(cfg.scene, scene)
-    tables = scene_tables(cfg.scene, scene, shapes, _light(cfg.sensor, key))
+    light: Any = camera.LIGHT
+    if key is not None and cfg.sensor.light > 0.0:
+        light = sensor.light(jax.random.fold_in(key, _LIGHT), cfg.sensor)
+    tables = scene_tables(cfg.scene, scene, shapes, light)
     if cfg.heightmap.view == "ortho":
         exact = ortho(cfg.heightmap, shapes, tables)
         return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
@@ -80,10 +83,8 @@ def polytopes(slots: tuple[SlotKind, ...], scene: SceneState) -> Polytopes:
 def _objects(cfg: SceneConfig, scene: SceneState) -> ObjectShapes:
     known, slot = object_slots.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
     number = scene.numbers[slot]
-    normal, offset, first, centre = (
-        jnp.asarray(leaf)[number]
-        for leaf in (known.normal, known.offset, known.first, known.centre)
-    )
+    leaves = known.normal, known.offset, known.first, known.centre
+    normal, offset, first, centre = (jnp.asarray(leaf)[number] for leaf in leaves)
     position = scene.position[slot]
     rotation = jax.vmap(geometry.quat_to_matrix)(scene.quaternion[slot])  # [M, 3, 3]
     # Products and sums, as in `raycast.world_half_spaces`.
@@ -96,13 +97,6 @@ def _objects(cfg: SceneConfig, scene: SceneState) -> ObjectShapes:
         jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
         known.radius,
     )
-
-
-def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
-    """Returns the unit vector [3] towards the light."""
-    if key is None or noise.light == 0.0:
-        return camera.LIGHT
-    return sensor.light(jax.random.fold_in(key, _LIGHT), noise)
 
 
 def scene_tables(
@@ -158,7 +152,6 @@ def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observ
 def _objects_below(
     cfg: HeightmapConfig, objects: ObjectShapes, hits: SurfaceHit, first: int
 ) -> SurfaceHit:
-    """Adds objects to the hits of rays straight down; their surfaces count from `first`."""
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
     side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
     low = objects.centre[:, 1::-1] - objects.radius  # y, x
@@ -195,7 +188,7 @@ def _windows(
     ray: raycast.Ray,
     first: int,
 ) -> SurfaceHit:
-    """Casts objects' windows, with corners [M, 2], whole numbers, moved into the grid."""
+    """Casts objects' windows, whose corners [M, 2], whole numbers, are moved into the grid."""
     most = np.array(hits.distance.shape) - side
     inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
     return raycast.cast_windows(objects, hits, inside, side, ray, first)
@@ -204,7 +197,7 @@ def _windows(
 def ortho_noisy(
     key: jax.Array, noise: SensorConfig, exact: Observation, tables: SurfaceTables
 ) -> Observation:
-    """Adds the noise of a depth sensor at VIEW_HEIGHT; cells without a depth are empty."""
+    """Adds the noise of a sensor at VIEW_HEIGHT; cells without a depth are empty."""
     key_depth, key_colour = jax.random.split(key)
     depth, valid = sensor.depth(key_depth, noise, VIEW_HEIGHT - exact.height)
     colour = jnp.where(valid[..., None], exact.colour, 0.0)
