@@ -222,7 +222,6 @@ def _infos(info: Info) -> dict[str, Any]:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _picture(cfg: Config, scene: SceneState) -> jax.Array:
-    """Draws the scene as PICTURE's camera sees it, [h, w, 3] uint8."""
     shapes = observe.scene_shapes(cfg.scene, scene)
     tables = observe.scene_tables(cfg.scene, scene, shapes)
     hits = observe.cast_pixels(cfg.change(camera=PICTURE), camera.make(PICTURE), shapes)

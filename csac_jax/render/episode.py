@@ -65,9 +65,8 @@ class EpisodeRenderer:
 
     def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
         """Shows the steps in a viewer, see `viewer.play`."""
-        rows = enumerate(steps, 1)
-        pictured = [viewer.Pictured(line(number, step), self.poses(step)) for number, step in rows]
-        viewer.play(self._model, pictured, log, again)
+        actions = [(line(number, step), self.poses(step)) for number, step in enumerate(steps, 1)]
+        viewer.play(self._model, actions, log, again)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()

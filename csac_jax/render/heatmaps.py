@@ -62,7 +62,6 @@ def draw_heights(cfg: Config, axes: Axes, height: Any) -> None:
 
 
 def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Colormap) -> AxesImage:
-    """Draws a map of the workspace [H, W], axes in mm, y upwards."""
     half = 500.0 * cfg.heightmap.extent
     image = axes.imshow(values, cmap, origin="lower", extent=(-half, half) * 2)
     axes.set_title(title, fontsize="medium")

@@ -61,7 +61,6 @@ def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
 
 
 def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    """Draws the height map with the search's candidates and the chosen action."""
     heatmaps.draw_heights(cfg, axes, step.before.obs.height)
     if step.debug is not None:
         style: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.4, "zorder": 3}

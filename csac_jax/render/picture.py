@@ -79,7 +79,6 @@ def _opengl_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
 
 
 def _light(model: mujoco.MjModel) -> None:
-    """Sets one bright lamp over the whole table, its shadows fine near the workspace."""
     model.light_pos[:], model.light_dir[:] = LAMP, -LAMP / np.linalg.norm(LAMP)
     model.light_cutoff[:], model.light_exponent[:] = 80.0, 0.0  # degrees; as bright at the edge
     model.light_diffuse[:], model.light_specular[:] = 0.45, 0.1

@@ -21,10 +21,7 @@ class Physics(Protocol):
     """A world in which a robot can be moved."""
 
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
-        """Moves the robot, one set-point per substep. One scene; callers vmap.
-
-        Blocks out of play stay where they are. Blocks in the hand at the end are still in play.
-        """
+        """Moves the robot, one set-point per substep; blocks out of play stay. Callers vmap."""
 
 
 def _make_mjx(world: World, cfg: SimConfig) -> Physics:
@@ -58,8 +55,7 @@ def prepare(physics: Physics, scenes: int) -> None:
 def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
-    """Runs a primitive chosen from the map `height` [H, W] m. Nothing moves if the robot cannot
-    follow the whole of it."""
+    """Runs a primitive over the map `height` [H, W] m; nothing moves if the robot cannot follow."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
@@ -76,10 +72,7 @@ def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
 
 
 def healthy(scene: SceneState) -> jax.Array:
-    """Returns [] bool, every entry of a scene lies within its bounds.
-
-    Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
-    """
+    """Returns [] bool, every entry of a scene lies within its bounds, which NaN does not."""
     reach = jnp.where(scene.in_play[:, None], 1.0, 100.0)  # m from the workspace centre
     speed = jnp.array([20.0, 20.0, 20.0, 200.0, 200.0, 200.0])  # m/s and rad/s
     length = jnp.sum(scene.quaternion**2, axis=1)

@@ -14,15 +14,11 @@ from csac_jax.sim.quiet_mjx import mjx
 ROWS = 32_775  # rows beyond 32,768 are those that go wrong
 STEPS = 25  # of falling balls, 0.1 s: each has hit the table, none has come to rest
 SCENES = 4
-BALL = """
-<mujoco>
+BALL = """<mujoco>
   <option timestep="0.004" solver="Newton" iterations="8" ls_iterations="8"/>
-  <worldbody>
-    <geom type="plane" size="1 1 0.1"/>
-    <body pos="0 0 0.025"><freejoint/><geom type="sphere" size="0.02" mass="0.1"/></body>
-  </worldbody>
-</mujoco>
-"""
+  <worldbody><geom type="plane" size="1 1 0.1"/>
+  <body pos="0 0 0.025"><freejoint/><geom type="sphere" size="0.02" mass="0.1"/></body></worldbody>
+</mujoco>"""
 
 
 class Check(NamedTuple):

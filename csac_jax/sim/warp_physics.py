@@ -89,7 +89,6 @@ def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _model_fields(world: World, scene: SceneState) -> dict[str, jax.Array]:
-    """Returns the model's fields with this scene's blocks, by name."""
     model, fields = world.model, scene_fields(world, scene)
     geoms, bodies = world.block_geoms, world.block_bodies
 
@@ -121,11 +120,7 @@ def _bounds(half: jax.Array) -> jax.Array:
 def _of_objects(
     world: World, objects: Bodies, fields: ObjectFields
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names of the model's fields, the places of objects in them and a scene's values.
-
-    A body's frame is at its centre of mass, so that a push there does not turn it: its inverse
-    weights are 1/m and the mean of 1/I.
-    """
+    """Yields names of the model's fields, the places of objects in them and a scene's values."""
     number, (bodies, geoms) = fields.number, (objects.bodies, objects.geoms)
 
     def known(rows: np.ndarray) -> jax.Array:
@@ -145,7 +140,7 @@ def _of_objects(
     yield "body_mass", bodies, mass
     yield "body_inertia", bodies, inertia
     yield "body_iquat", bodies, known(objects.tables.axes)
-    yield "body_ipos", bodies, 0.0
+    yield "body_ipos", bodies, 0.0  # so a push there does not turn it: 1/m and the mean of 1/I
     weights = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=1)], axis=1)
     yield "body_invweight0", bodies, weights
     yield "dof_invweight0", world.block_dofs[objects.slots], jnp.repeat(weights, 3, axis=1)

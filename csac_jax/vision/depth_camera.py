@@ -85,7 +85,8 @@ def measure(
     radius = max(1, round(camera.window * eye.focal[0]))
     inverse = jnp.where(valid, 1.0 / jnp.where(valid, exact, 1.0), 0.0)  # [h, w] 1/m
     around = _shifted(inverse, radius)
-    edge = _bend(inverse, around) > JUMP * inverse**2
+    bends = jnp.abs(around[::2] + around[1::2] - 2.0 * inverse[None])  # [2, h, w], 0 on a plane
+    edge = jnp.max(bends, axis=0) > JUMP * inverse**2
     cosine = _cosine(eye, inverse, around, radius)
     draw = jax.random.uniform(key_edge, exact.shape)
     mixed = edge & (draw >= LOST) & (draw < LOST + FLYING)
@@ -110,24 +111,15 @@ def supported(depth: jax.Array, focal: Any) -> jax.Array:
 
 
 def _shifted(inverse: jax.Array, radius: int) -> jax.Array:
-    """Returns the pixels `radius` to the right, left, below and above [4, h, w]; edges repeat."""
+    """Returns the pixels to the right, left, below and above [4, h, w]; edges repeat."""
     padded, size = jnp.pad(inverse, radius, mode="edge"), inverse.shape
     starts = ((radius, 2 * radius), (radius, 0), (2 * radius, radius), (0, radius))
     return jnp.stack([jax.lax.dynamic_slice(padded, start, size) for start in starts])
 
 
-def _bend(inverse: jax.Array, around: jax.Array) -> jax.Array:
-    """Returns how far inverse depths [h, w] 1/m are from a plane's; 0 on one."""
-    right, left, below, above = around
-    along, across = jnp.abs(right + left - 2.0 * inverse), jnp.abs(below + above - 2.0 * inverse)
-    return jnp.maximum(along, across)
-
-
 def _cosine(eye: CameraConfig, inverse: jax.Array, around: jax.Array, radius: int) -> jax.Array:
-    """Returns the cosine [h, w] of the angle between a surface's normal and the pixel's ray.
-
-    On the plane n . p = 1 the pixel (x, y, 1) has the inverse depth n . (x, y, 1).
-    """
+    """Returns the cosine [h, w] of the angle between a surface's normal and the pixel's ray."""
+    # On the plane n . p = 1 the pixel (x, y, 1) has the inverse depth n . (x, y, 1).
     right, left, below, above = around
     rows, cols = inverse.shape
     x = ((jnp.arange(cols, dtype=jnp.float32) - eye.centre[0]) / eye.focal[0])[None]

@@ -1,11 +1,8 @@
-"""From the state of one scene to its observation.
+"""From the state of one scene to its observation, with a key and sensor noise if wished.
 
-There are two views (`HeightmapConfig.view`). `ortho` is complete: one ray straight down per cell.
-`oblique` is the depth image of a camera at the side, its points projected along gravity as in VPG
-(arXiv:1803.09956); hidden cells are empty. With a key, either has sensor noise.
-
-A surface is a face of a geom or the table, numbered as in `raycast.SurfaceHit`. S = surfaces, G =
-geoms, [h, w] = camera pixels.
+`HeightmapConfig.view` `ortho` is complete: one ray straight down per cell. `oblique` is the depth
+image of a camera at the side, its points projected along gravity as in VPG (arXiv:1803.09956);
+hidden cells are empty. S = surfaces, see `raycast.SurfaceHit`, G = geoms, [h, w] = camera pixels.
 """
 
 import math
@@ -134,13 +131,11 @@ def surface_tables(
 
 
 def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observation:
-    """Observes from above: one ray from VIEW_HEIGHT through every cell centre.
-
-    The direction has no ray axis under vmap, so a plane costs one scalar product per ray.
-    """
+    """Observes from above: one ray from VIEW_HEIGHT through every cell centre."""
     height = jnp.full((cfg.size, cfg.size, 1), VIEW_HEIGHT, jnp.float32)
     origin = jnp.concatenate([geometry.cell_centres(cfg), height], axis=-1).reshape(-1, 3)
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
+    # The direction has no ray axis, so a plane costs one scalar product per ray.
     cast = jax.vmap(raycast.cast_polytopes, in_axes=(None, 0, None))
     hits = SurfaceHit(*(leaf.reshape(cfg.size, -1) for leaf in cast(shapes.blocks, origin, down)))
     if shapes.objects is not None:
@@ -161,7 +156,7 @@ def _objects_below(
         x, y = ((i.astype(jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell for i in (columns, rows))
         return jnp.stack([x, y, jnp.full_like(x, VIEW_HEIGHT)], axis=-1), down
 
-    return _windows(objects, hits, corner, (side, side), ray, first)
+    return raycast.cast_windows(objects, hits, corner, (side, side), ray, first)
 
 
 def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
@@ -177,21 +172,7 @@ def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
     def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         return eye.position, camera.direction(eye, rows, columns)
 
-    return _windows(objects, hits, corner, side, ray, shapes.first)
-
-
-def _windows(
-    objects: ObjectShapes,
-    hits: SurfaceHit,
-    corner: jax.Array,
-    side: tuple[int, int],
-    ray: raycast.Ray,
-    first: int,
-) -> SurfaceHit:
-    """Casts objects' windows, whose corners [M, 2], whole numbers, are moved into the grid."""
-    most = np.array(hits.distance.shape) - side
-    inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
-    return raycast.cast_windows(objects, hits, inside, side, ray, first)
+    return raycast.cast_windows(objects, hits, corner, side, ray, shapes.first)
 
 
 def ortho_noisy(

@@ -46,8 +46,8 @@ def enter_half_spaces(
     never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
     that share a direction share the division.
     """
-    start = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
-    enter, leave, face = clip(normal, offset, origin, direction, *start, 0)
+    whole = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
+    enter, leave, face = clip(normal, offset, origin, direction, whole, 0)
     return enter, face, (enter >= 0.0) & (enter <= leave)
 
 
@@ -56,12 +56,11 @@ def clip(
     offset: jax.Array,
     origin: Vector,
     direction: Vector,
-    enter: jax.Array,
-    leave: jax.Array,
-    face: jax.Array,
+    part: tuple[jax.Array, jax.Array, jax.Array],
     first: jax.Array | int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cuts a ray's part from `enter` to `leave` by half-spaces, numbered from `first`. All []."""
+    """Cuts a ray's part (enter, leave, face), all [], by half-spaces, numbered from `first`."""
+    enter, leave, face = part
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
         inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from csac_jax.vision import ray_shapes
@@ -116,9 +117,8 @@ def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) ->
         nearest, part = carry
         normal, offset, first, number = chunk
         nearest = ended(nearest, part, first)
-        enter, leave, face = jax.tree.map(functools.partial(jnp.where, first), outside, part)
-        ray = origin, direction
-        part = ray_shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
+        part = jax.tree.map(functools.partial(jnp.where, first), outside, part)
+        part = ray_shapes.clip(normal, offset, origin, direction, part, number * faces)
         return (nearest, part), None
 
     far, no_face = jnp.float32(jnp.inf), jnp.int32(0)
@@ -140,10 +140,12 @@ def cast_windows(
 ) -> SurfaceHit:
     """Adds objects to the hits [h, w] of a grid of rays; each is tested on a window of rays only.
 
-    Args: corner [M, 2] int32, first row and column of each object's window, which lies in the grid
-    and holds all rays that meet the object; side, its rows and columns; ray, see `Ray`; first,
-    number of the objects' first surface.
+    Args: corner [M, 2], whole numbers, first row and column of each object's window, which is moved
+    into the grid and holds all rays that meet the object; side, its rows and columns; ray, see
+    `Ray`; first, number of the objects' first surface.
     """
+    most = jnp.asarray(np.array(hits.distance.shape) - side, jnp.float32)
+    corner = jnp.clip(corner, 0.0, most[None]).astype(jnp.int32)
     rows, columns = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in side), indexing="ij")
     size = objects.offset.shape[1] * objects.offset.shape[2]
 

@@ -65,10 +65,8 @@ def floor(position: jax.Array) -> jax.Array:
 
 
 def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
-    """Interpolates the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells; returns [].
-
-    Cell centres are whole numbers; outside, the nearest edge counts. Differentiable in both.
-    """
+    """Interpolates the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells, whose centres
+    are whole numbers; outside, the nearest edge counts. Differentiable in both."""
     height, width = values.shape
     row = jnp.clip(row_col[0], 0.0, height - 1.0)
     col = jnp.clip(row_col[1], 0.0, width - 1.0)

@@ -1,7 +1,6 @@
 """Errors of a real depth camera; those that are off are left out of the program.
 
-real = sensor.pose(key_pose, cfg, camera.make(believed))  # draw rgb and depth from here
-rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)
+An image of another renderer, drawn from the camera of `pose`, goes through `image`.
 """
 
 from typing import Any
@@ -29,10 +28,7 @@ def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
 
 
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Measures exact depths m of any shape; returns them and bool, a pixel has one.
-
-    Normal with standard deviation floor + square d^2; source: SensorConfig.
-    """
+    """Measures exact depths m of any shape; returns them and bool, there is one."""
     key_noise, key_drop = jax.random.split(key)
     measured, valid = exact, jnp.ones(exact.shape, bool)
     floor, square = cfg.depth_noise

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from csac_jax.vision import raycast
+from tests.vision import mujoco_rays
 
 _OCTAGON = [(np.cos(a), np.sin(a)) for a in np.pi / 4 * (np.arange(8) + 0.5)]
 _MESHES = {
@@ -37,19 +38,10 @@ class Reference(NamedTuple):
     data: mujoco.MjData
     polytopes: raycast.Polytopes
 
-    def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, int, np.ndarray]:
-        """Distance, geom (-2 for a miss) and normal of one ray, from C MuJoCo."""
-        geom, normal = np.zeros((1, 1), np.int32), np.zeros((3, 1))
-        start, along = origin[:, None], direction[:, None]
-        distance = mujoco.mj_ray(self.model, self.data, start, along, None, 1, -1, geom, normal)
-        return distance, int(geom[0, 0]) - 1, normal[:, 0]
-
-    def rays(
-        self, origins: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distances [R], geoms [R] and normals [R, 3] of many rays."""
-        distance, geom, normal = zip(*map(self.ray, origins, directions), strict=True)
-        return np.array(distance), np.array(geom), np.array(normal)
+    def rays(self, origins: np.ndarray, directions: np.ndarray) -> mujoco_rays.Rays:
+        """Hits of rays from C MuJoCo, -1 for the table and -2 for a miss."""
+        hits = mujoco_rays.cast(self.model, self.data, origins, directions)
+        return hits._replace(geom=hits.geom - 1)
 
     def near_edge(self, origins: np.ndarray, directions: np.ndarray, shift: float) -> np.ndarray:
         """[R] bool, a ray `shift` m beside this one meets another face or nothing."""
