@@ -10,7 +10,7 @@ Observations are dicts: `colour` [H, W, 3] uint8, `height` [H, W] float32 m, and
 
 import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import jax
@@ -50,7 +50,7 @@ class Interface:
         """Makes the interface of a config or preset. Raises ValueError for bad arguments."""
         if scenes < 1:
             raise ValueError(f"num_envs: must be at least 1, not {scenes}")
-        if actions not in ("continuous", "dense"):
+        if actions not in get_args(ActionKind):
             raise ValueError(f"actions: {actions!r} is not one of: continuous, dense")
         cfg = presets.get(config) if isinstance(config, str) else config
         cache.enable()

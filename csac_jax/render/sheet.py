@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -37,7 +38,8 @@ def _draw(axes: Any, member: Object, reach: float, colour: np.ndarray) -> None:
     triangles = np.concatenate(corners)  # [T, 3, 3]
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    faces = np.clip(np.asarray(camera.shade(colour[None], normal)), 0.0, 1.0)
+    lit = camera.shade(jnp.asarray(colour[None]), jnp.asarray(normal))
+    faces = np.clip(np.asarray(lit), 0.0, 1.0)
     axes.add_collection3d(Poly3DCollection(triangles, facecolors=faces))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     axes.set_box_aspect((1, 1, 1))

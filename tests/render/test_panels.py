@@ -5,7 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
@@ -126,15 +125,3 @@ def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tupl
     np.testing.assert_array_equal(told[: size[0]], bare[: size[0]])
     assert (told[size[0] :] < 255).any()
     assert (bare[size[0] :] == 255).all()
-
-
-def test_panels_are_drawn_once(monkeypatch: pytest.MonkeyPatch):
-    """Claim: however many pictures an action has, its panels are drawn once."""
-    drawn = []
-    draw = FigureCanvasAgg.draw
-    monkeypatch.setattr(FigureCanvasAgg, "draw", lambda self: (drawn.append(self), draw(self)))
-    complete = panels.frame(CFG, _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True), 120)
-    panels.text_line.cache_clear()
-    for shade in range(5):
-        assert complete(np.full((120, 160, 3), shade, np.uint8), "push")[0, 0, 0] == shade
-    assert len(drawn) == 2  # panels and text

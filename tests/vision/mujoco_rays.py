@@ -40,6 +40,18 @@ def nominal_meshes() -> Iterator[None]:
         yield
 
 
+def placed(world: models.World, scene: scene_state.SceneState) -> Placed:
+    """A scene of a world that was built by `nominal_meshes`, the hand high above."""
+    with nominal_meshes():
+        fields = jax.device_get(models.scene_fields(world, scene))
+    model = models.with_blocks(world, fields)
+    data = mujoco.MjData(model)
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    data.qpos[world.robot_qpos[2]] = 3.0
+    mujoco.mj_kinematics(model, data)
+    return Placed(model, data)
+
+
 def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
     scene = scene_state.parked(SLOTS)

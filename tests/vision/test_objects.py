@@ -5,7 +5,6 @@ import subprocess
 import sys
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 
@@ -45,17 +44,6 @@ def scattered(rng: np.random.Generator) -> SceneState:
     return object_slots.drawn(rng, CONFIG.scene, scene)
 
 
-def in_c(world: model.World, scene: SceneState) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The scene in C MuJoCo, the hand high above."""
-    with mujoco_rays.nominal_meshes():
-        exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
-    data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    data.qpos[world.robot_qpos[2]] = 3.0
-    mujoco.mj_kinematics(exact, data)
-    return exact, data
-
-
 from_above = jax.jit(functools.partial(observe.observe, CONFIG))
 
 
@@ -68,7 +56,7 @@ def compare(world: model.World, seeds: range) -> float:
     for seed in seeds:
         scene = scattered(np.random.default_rng(seed)).replace(target=np.int32(seed % len(KINDS)))
         obs = jax.device_get(from_above(scene))
-        distance, geom, _ = mujoco_rays.cast(*in_c(world, scene), origin, down)
+        distance, geom, _ = mujoco_rays.cast(*mujoco_rays.placed(world, scene), origin, down)
         apart.append(np.abs(obs.height.ravel() - (VIEW_HEIGHT - distance)) > 1e-4)
         own = world.slot_of_geom[geom] == scene.target
         assert np.mean(own != obs.target.ravel()) < 1e-3
@@ -93,7 +81,9 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
     rays = np.asarray(camera.directions(camera.make(CONFIG.camera)), np.float64).reshape(-1, 3)
     for seed in range(6):
         scene = scattered(np.random.default_rng(seed))
-        distance = mujoco_rays.cast(*in_c(world, scene), CONFIG.camera.position, rays).distance
+        distance = mujoco_rays.cast(
+            *mujoco_rays.placed(world, scene), CONFIG.camera.position, rays
+        ).distance
         apart = np.abs(np.asarray(depths(scene)).ravel() - distance) > 1e-4
         assert apart.mean() < 1e-4, seed
 
