@@ -89,21 +89,14 @@ class _Motion(NamedTuple):
     """One action as physics ran it."""
 
     before: SceneState  # empty where it was invalid
-    after: SceneState  # as before where physics diverged
+    after: SceneState  # without blocks that are gone; as before where physics diverged
     trace: Trace
     surface: jax.Array  # [] m, see `primitives.Plan`
     is_grasp: jax.Array  # [] bool
     hand_rise: jax.Array  # [] m, from the lowest set-point
     diverged: jax.Array  # [] bool, physics failed
-
-
-class _Removal(NamedTuple):
-    """Blocks taken off the table. N = block slots."""
-
-    scene: SceneState  # without them
-    lifted: jax.Array  # [N] bool, in the hand
-    lost: jax.Array  # [N] bool, outside the workspace
-    success: jax.Array  # [N] bool, lifted and wanted
+    lifted: jax.Array  # [N] bool, blocks in the hand
+    lost: jax.Array  # [N] bool, blocks that left the workspace
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -159,10 +152,8 @@ class Env:
         return State(scene, obs, zero, no, no, count, count, count, info, noise_key)
 
     def auto_reset(self, key: jax.Array, state: State) -> State:
-        """Starts the episode after the one that ended in `state`, in a fresh scene.
-
-        In the task `target`, after a success, it is the same scene with a new target.
-        """
+        """Starts the episode after `state` in a fresh scene, or in the same scene with a new target
+        after a success in the task `target`."""
         key_scene, key_target = jax.random.split(key)
         scene = self._sample_scene(key_scene)
         if self.cfg.task.kind == "target":
@@ -173,14 +164,12 @@ class Env:
     def step(self, state: State, action: Action) -> State:
         """Returns the state after one action, without the blocks that were lifted or pushed out.
 
-        Nothing moves for an action that the robot cannot follow. Where physics diverges, as it does
-        at a pose that is not finite, the scene stays as it was. A scene that was invalid before
-        becomes empty. `state.done` is not read.
+        Nothing moves for an action that the robot cannot follow, or whose pose is not finite, or
+        where physics diverges. A scene that was invalid before becomes empty.
         """
         before, valid = self._validate(state)
         motion = self._move(before, valid, state.obs.height, action)
-        removal = self._remove(motion)
-        return self._judge(state, action, motion, removal)
+        return self._judge(state, action, motion)
 
     def _validate(self, state: State) -> tuple[SceneState, jax.Array]:
         """Returns the scene, empty if it or the observation is out of bounds, and [] bool."""
@@ -193,51 +182,44 @@ class Env:
     def _move(
         self, before: SceneState, valid: jax.Array, height: jax.Array, action: Action
     ) -> _Motion:
-        """Runs the primitive; undoes it where physics diverged."""
+        """Runs the primitive, or undoes it where physics diverged; takes blocks off the table."""
         after, trace, plan = simulation.execute(self.physics, self.cfg, before, height, action)
         finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
         diverged = ~(valid & finite & simulation.healthy(after))
         after = _select(diverged, before, after)
         is_grasp = action.primitive == Primitive.GRASP
         hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-        return _Motion(before, after, trace, plan.surface, is_grasp, hand_rise, diverged)
+        lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~diverged
+        inside = scene_state.inside(after.position, self.cfg.heightmap.extent)
+        lost = after.in_play & ~inside & ~lifted
+        after = scene_state.park(after, ~lifted & ~lost)
+        judged = plan.surface, is_grasp, hand_rise, diverged, lifted, lost
+        return _Motion(before, after, trace, *judged)
 
-    def _remove(self, motion: _Motion) -> _Removal:
-        """Takes blocks off the table that were lifted or left the workspace."""
-        after = motion.after
-        lifted = outcome.lifted_blocks(motion.trace, motion.hand_rise)
-        lifted = lifted & motion.is_grasp & ~motion.diverged
-        lost = (
-            after.in_play & ~scene_state.inside(after.position, self.cfg.heightmap.extent) & ~lifted
-        )
-        success = lifted & scene_state.is_target(motion.before)
-        return _Removal(scene_state.park(after, ~lifted & ~lost), lifted, lost, success)
-
-    def _judge(self, state: State, action: Action, motion: _Motion, removal: _Removal) -> State:
+    def _judge(self, state: State, action: Action, motion: _Motion) -> State:
         """Observes the scene that is left; counts actions, rewards and ends the episode."""
-        scene, actions = removal.scene, state.actions + 1
+        scene, actions = motion.after, state.actions + 1
         obs = self._observe(scene, state.noise_key, actions)
         moved = heightmap.moved_area(self.cfg.heightmap, state.obs.height, obs.height)
-        changed = moved > CHANGE_AREA
-        unchanged_steps = jnp.where(changed, 0, state.steps_without_change + 1)
+        unchanged_steps = jnp.where(moved > CHANGE_AREA, 0, state.steps_without_change + 1)
         terminated = ~jnp.any(scene.in_play & scene_state.is_target(scene))
-        failed = jnp.where(jnp.any(removal.lifted), 0, state.failed_grasps + 1)
+        failed = jnp.where(jnp.any(motion.lifted), 0, state.failed_grasps + 1)
         failed_grasps = jnp.where(motion.is_grasp, failed, state.failed_grasps)
         task = self.cfg.task
         capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
         if self.max_failures:
             capped |= failed_grasps >= self.max_failures
-        info = _info(action, motion, removal, moved, changed)
+        success = jnp.any(motion.lifted & scene_state.is_target(motion.before))
         return State(
             scene=scene,
             obs=obs,
-            reward=jnp.any(removal.success).astype(jnp.float32),
+            reward=success.astype(jnp.float32),
             terminated=terminated & ~motion.diverged,
             truncated=(capped & ~terminated) | motion.diverged,
             actions=actions,
             steps_without_change=unchanged_steps,
             failed_grasps=failed_grasps,
-            info=info,
+            info=_info(action, motion, success, moved),
             noise_key=state.noise_key,
         )
 
@@ -276,8 +258,8 @@ class AutoResetEnv:
     def step(self, key: jax.Array, state: State, action: Action) -> tuple[State, State]:
         """Returns the state to act in next, and the state after the action: carry, output of scan.
 
-        The second has reward, info and, where done, the terminal observation; the first is then
-        the first state of the next episode.
+        Where an episode is done, the first begins the next one and the second has its last
+        observation.
         """
         after = self.env.step(state, action)
         return _select(after.done, self.env.auto_reset(key, after), after), after
@@ -286,33 +268,31 @@ class AutoResetEnv:
 def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | None = None) -> Env:
     """Makes the environment of a config; physics `auto` is resolved for this machine.
 
-    The pool of scenes is settled once and cached on disk. Evaluation draws from another `stream` of
-    random numbers and needs `num_scenes` or more; None is the config's `scene.pool`. Raises
-    SceneError for blocks that do not come to rest, and for physics that is not installed.
+    The pool of `num_scenes` scenes, None for the config's `scene.pool`, is drawn from a `stream` of
+    random numbers, settled once and cached on disk. Raises SceneError for blocks that do not come
+    to rest, and for physics that is not installed.
     """
     cfg = backend.resolve(cfg)
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
     return Env(cfg, physics, pool.scenes(cfg, stream, num_scenes))
 
 
-def _info(
-    action: Action, motion: _Motion, removal: _Removal, moved: jax.Array, changed: jax.Array
-) -> Info:
-    """Judges one action; the height map `moved` [] cm^2, enough to have `changed` []."""
-    lifted = removal.lifted
+def _info(action: Action, motion: _Motion, success: jax.Array, moved: jax.Array) -> Info:
+    """Judges one action that `moved` [] cm^2; a `success` [] bool lifted a wanted block."""
+    lifted = motion.lifted
     distance = jnp.linalg.norm(motion.before.position[:, :2] - action.pose[:2], axis=1)
-    wrong = jnp.any(lifted) & ~jnp.any(removal.success)
+    wrong = jnp.any(lifted) & ~success
     best = jnp.where(wrong, jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.LIFTED))
     best = jnp.where(motion.is_grasp, best, jnp.int32(Outcome.NOTHING))
     by_truth = outcome.grasp_outcome(motion.trace, motion.surface, motion.hand_rise)
-    by_gap = outcome.grasp_outcome_by_gap(motion.trace, motion.surface, changed)
+    by_gap = outcome.grasp_outcome_by_gap(motion.trace, motion.surface, moved > CHANGE_AREA)
     return Info(
         outcome=jnp.minimum(by_truth, best),
         outcome_by_gap=jnp.minimum(by_gap, best),
         moved=moved,
         distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, distance, jnp.inf)), 0.0),
         cleared=jnp.sum(lifted, dtype=jnp.int32),
-        blocks_lost=jnp.sum(removal.lost, dtype=jnp.int32),
+        blocks_lost=jnp.sum(motion.lost, dtype=jnp.int32),
         contact_overflow=motion.trace.contact_overflow,
         physics_diverged=motion.diverged,
     )

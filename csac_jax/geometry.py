@@ -1,7 +1,7 @@
 """Poses, angles, and the cells of heightmaps in metres.
 
 Quaternions are (w, x, y, z), of unit length. Heightmap rows run along y and columns along x. Row 0
-and column 0 lie at the lowest y and x. Shapes `[..., n]` may have any leading axes.
+and column 0 lie at the lowest y and x.
 """
 
 import jax
@@ -49,12 +49,8 @@ def rotate2d(yaw: jax.Array, xy: jax.Array) -> jax.Array:
 
 
 def wrap_angle(angle: jax.Array) -> jax.Array:
-    """Wraps angles of any shape to [0, 2 pi) rad.
-
-    In float32 the remainder of a tiny negative angle is 2 pi itself, and that of a denormal stays
-    negative. Both become 0.
-    """
-    wrapped = jnp.mod(angle, FULL_TURN)
+    """Wraps angles of any shape to [0, 2 pi) rad."""
+    wrapped = jnp.mod(angle, FULL_TURN)  # 2 pi itself for a tiny negative angle, < 0 for a denormal
     return jnp.where((wrapped >= FULL_TURN) | (wrapped <= 0.0), 0.0, wrapped)
 
 

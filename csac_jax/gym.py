@@ -10,7 +10,7 @@ Observations are dicts: `colour` [H, W, 3] uint8, `height` [H, W] float32 m, and
 
 import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import gymnasium
 import jax
@@ -50,7 +50,7 @@ class Interface:
         """Makes the interface of a config or preset. Raises ValueError for bad arguments."""
         if scenes < 1:
             raise ValueError(f"num_envs: must be at least 1, not {scenes}")
-        if actions not in ("continuous", "dense"):
+        if actions not in get_args(ActionKind):
             raise ValueError(f"actions: {actions!r} is not one of: continuous, dense")
         cfg = presets.get(config) if isinstance(config, str) else config
         cache.enable()
@@ -79,8 +79,8 @@ class Interface:
 
     @property
     def _cells(self) -> tuple[int, ...]:
-        size = self.env.cfg.heightmap.size
-        return len(Primitive), self.env.cfg.net.rotations, size, size
+        cfg = self.env.cfg
+        return len(Primitive), cfg.net.rotations, cfg.heightmap.size, cfg.heightmap.size
 
     def action(self, action: jax.Array) -> Action:
         """Converts an action of the action space to the environment's."""
@@ -115,8 +115,7 @@ class ClutterEnv(gymnasium.Env[Any, Any]):
         actions: ActionKind = "continuous",
         render_mode: str | None = None,
     ) -> None:
-        """Settles its scenes once; the first `reset` and `step` compile. See `Interface.make` for
-        arguments and errors."""
+        """Settles its scenes once; see `Interface.make` for arguments and errors."""
         self.interface = Interface.make(config, actions, 1)
         self.observation_space = self.interface.observation_space
         self.action_space = self.interface.action_space
@@ -124,8 +123,7 @@ class ClutterEnv(gymnasium.Env[Any, Any]):
         env = self.interface.env
         self._reset = jax.jit(env.reset)
         self._step = jax.jit(lambda state, action: env.step(state, self.interface.action(action)))
-        self.state: State | None = None
-        """The environment's state, ground truth too; None before the first reset."""
+        self.state: State | None = None  # ground truth too; None before the first reset
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -171,13 +169,12 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
             return auto.step(key, state, self.interface.action(action))
 
         self._reset, self._step = jax.jit(jax.vmap(auto.reset)), jax.jit(jax.vmap(step))
-        self.state: State | None = None
-        """The states to act in next, leaves [E, ...]; None before the first reset."""
+        self.state: State | None = None  # to act in next, leaves [E, ...]; None before a reset
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Starts episodes; returns their first observations and an empty info."""
+        """Starts episodes, see `ClutterEnv.reset`."""
         super().reset(seed=seed)
         self.state = self._reset(self._keys())
         return self.interface.observation(self.state.obs), {}
@@ -185,13 +182,11 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
     def step(
         self, actions: Any
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Steps every scene. `info` is of these actions, also where an episode ended. Raises
-        ResetNeeded before the first reset."""
+        """Steps every scene, see `ClutterEnv.step`; `info` is of these actions."""
         state = _ready(self.state)
         self.state, after = self._step(self._keys(), state, jnp.asarray(actions))
         ends = np.array(after.terminated), np.array(after.truncated)
-        info = _infos(after.info)
-        done = ends[0] | ends[1]
+        info, done = _infos(after.info), ends[0] | ends[1]
         if done.any():
             info |= {"final_obs": self._final(after.obs, done), "_final_obs": done}
             info |= {"final_info": _infos(after.info), "_final_info": done}
@@ -203,10 +198,9 @@ class ClutterVectorEnv(VectorEnv[dict[str, np.ndarray], Any, np.ndarray]):
 
     def _final(self, obs: Observation, done: np.ndarray) -> np.ndarray:
         """Returns the last observations of episodes [E], None elsewhere."""
-        parts, final = self.interface.observation(obs), np.full(self.num_envs, None, object)
-        for number in np.flatnonzero(done):
-            final[number] = {name: part[number] for name, part in parts.items()}
-        return final
+        parts = self.interface.observation(obs)
+        rows = ({name: part[i] for name, part in parts.items()} for i in range(self.num_envs))
+        return np.array([row if over else None for row, over in zip(rows, done, strict=True)])
 
 
 def _ready(state: State | None) -> State:
@@ -228,7 +222,6 @@ def _infos(info: Info) -> dict[str, Any]:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _picture(cfg: Config, scene: SceneState) -> jax.Array:
-    """Draws the scene as PICTURE's camera sees it, [h, w, 3] uint8."""
     shapes = observe.scene_shapes(cfg.scene, scene)
     tables = observe.scene_tables(cfg.scene, scene, shapes)
     hits = observe.cast_pixels(cfg.change(camera=PICTURE), camera.make(PICTURE), shapes)

@@ -64,16 +64,6 @@ class FakeArm:
         return [0.41, 0.1, 0.15, 0.0, 3.1, 0.0]
 
 
-def test_set_points_are_the_tool_s_poses():
-    """Claim: a set-point's rotation vector turns as the tool's matrix does."""
-    points = UR["set_points"](_decision(), 0.85, 0.0)
-    for point, waypoint in zip(points, _decision()["waypoints"], strict=True):
-        tool = np.array(waypoint["tool"])
-        np.testing.assert_allclose(point[:3], tool[:3, 3])
-        turned = Rotation.from_rotvec(point[3:]).as_matrix()
-        np.testing.assert_allclose(turned, tool[:3, :3], atol=1e-9)
-
-
 def test_pose_out_of_reach_is_refused():
     """Claim: nothing moves if a set-point is no number, out of reach, too low, or unsafe."""
     arm, low, high = FakeArm(), SimpleNamespace(**{**vars(ARGS), "lowest": 0.15}), _decision()
@@ -91,7 +81,14 @@ def test_pose_out_of_reach_is_refused():
 
 
 def test_arm_goes_through_the_waypoints():
-    """Claim: fingers open before the approach and close before `act`; the arm visits all four."""
+    """Claim: fingers open before the approach and close before `act`; the arm visits all four; a
+    set-point's rotation vector turns as the tool's matrix does."""
+    points = UR["set_points"](_decision(), 0.85, 0.0)
+    for point, waypoint in zip(points, _decision()["waypoints"], strict=True):
+        tool = np.array(waypoint["tool"])
+        np.testing.assert_allclose(point[:3], tool[:3, 3])
+        turned = Rotation.from_rotvec(point[3:]).as_matrix()
+        np.testing.assert_allclose(turned, tool[:3, :3], atol=1e-9)
     arm = FakeArm()
     assert UR["execute"](arm, arm, arm.gripper, _decision(), ARGS)
     openings = [0.11, 0.11, 0.0, 0.0]

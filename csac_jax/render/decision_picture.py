@@ -33,7 +33,6 @@ def picture(cfg: Config, view: CameraView, decisions: list[Decision], values: Ma
 
 
 def _draw_image(cfg: Config, axes: Axes, view: CameraView, decisions: list[Decision]) -> None:
-    """Draws the image with the workspace's border; the best decision on top."""
     axes.imshow(view.colour)
     axes.set_title(line(decisions[0]) if decisions else "nothing to act on", fontsize="medium")
     axes.set(autoscale_on=False)
@@ -50,7 +49,7 @@ def _draw_image(cfg: Config, axes: Axes, view: CameraView, decisions: list[Decis
 def paths(decision: Decision, half_finger: float) -> list[np.ndarray]:
     """Returns lines [n, 3] m: a push's way; a grasp's descent, gap and fingers, `half_finger` m."""
     places = np.array([waypoint.position for waypoint in decision.waypoints])
-    if decision.primitive == Primitive.PUSH.name.lower():
+    if decision.primitive == "push":
         return [places[:3]]
     along = np.array([np.cos(decision.yaw), np.sin(decision.yaw), 0.0])
     across = half_finger * np.array([-along[1], along[0], 0.0])

@@ -49,10 +49,7 @@ class EpisodeRenderer:
         return self._frame(step)(self._start(step), text)
 
     def motion(self, step: StepRecord, text: str) -> Iterator[np.ndarray]:
-        """Draws the action as it runs in C MuJoCo; a still picture if the robot cannot do it.
-
-        With views, `text` up to its colon is below, and all of it in HOLD more pictures of the end.
-        """
+        """Draws the action as C MuJoCo runs it; with views, its end HOLD times more."""
         image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
         for pose in self.poses(step):
@@ -68,11 +65,8 @@ class EpisodeRenderer:
 
     def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
         """Shows the steps in a viewer, see `viewer.play`."""
-        texts = [line(number, step) for number, step in enumerate(steps, 1)]
-        pictured = [
-            viewer.Pictured(text, self.poses(step)) for text, step in zip(texts, steps, strict=True)
-        ]
-        viewer.play(self._model, pictured, log, again)
+        actions = [(line(number, step), self.poses(step)) for number, step in enumerate(steps, 1)]
+        viewer.play(self._model, actions, log, again)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()
@@ -130,7 +124,7 @@ def summary(env: Env, steps: list[StepRecord]) -> str:
 
 
 def completed(steps: list[StepRecord]) -> bool:
-    """Returns True if the hand took all blocks that the task asks for."""
+    """Returns True if the hand took all wanted blocks."""
     last, (_, lost) = steps[-1].after, totals(steps)
     got = last.reward > 0 if last.scene.target != scene_state.ANY else lost == 0
     return bool(last.terminated and got)

@@ -26,17 +26,15 @@ def choose() -> str | None:
     """Sets MUJOCO_GL, unless it is set, to a backend that draws; returns it, or None."""
     if backend := os.environ.get(VARIABLE, "").lower():
         return None if backend in OFF else backend
-    for backend in BACKENDS:
-        if _draws(backend):
-            os.environ[VARIABLE] = backend
-            return backend
-    return None
+    drawing = next(filter(_draws, BACKENDS), None)
+    if drawing is not None:
+        os.environ[VARIABLE] = drawing
+    return drawing
 
 
 def _draws(backend: str) -> bool:
     """Tries a backend in its own process, which a broken driver may end."""
     command, env = [sys.executable, "-c", _PROBE], os.environ | {VARIABLE: backend}
-    with contextlib.suppress(subprocess.SubprocessError):
-        subprocess.run(command, env=env, capture_output=True, timeout=60, check=True)
-        return True
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        return not subprocess.run(command, env=env, capture_output=True, timeout=60).returncode
     return False

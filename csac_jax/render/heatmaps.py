@@ -27,8 +27,10 @@ BAR = (1.04, 0.0, 0.05, 1.0)  # colour bar right of a map, in shares of it
 def figure(width: float, height: float, scene_height: int) -> Figure:
     """Makes a blank figure of even sides, px, as videos need."""
     dpi = DPI * max(scene_height / 480.0, 0.1)  # smaller letters cannot be drawn
-    sides = [(2 * round(0.5 * side) + 0.1) / dpi for side in (width, height)]  # Agg rounds down
-    return Figure((sides[0], sides[1]), dpi)
+    across, up = (
+        (2 * round(0.5 * side) + 0.1) / dpi for side in (width, height)
+    )  # Agg rounds down
+    return Figure((across, up), dpi)
 
 
 def pixels(fig: Figure) -> np.ndarray:
@@ -48,20 +50,18 @@ def draw_q_maps(cfg: Config, axes: tuple[Axes, Axes], q: Any) -> None:
         title = f"{primitive.name.title()} value, {best}"
         image = _draw_map(cfg, ax, title, values, colours)
         image.set_clim(valid.min(), valid.max())
-    bar = ax.inset_axes(BAR)
-    ax.figure.colorbar(image, cax=bar, label="Q, best over yaws")
+    ax.figure.colorbar(image, cax=ax.inset_axes(BAR), label="Q, best over yaws")
 
 
 def draw_heights(cfg: Config, axes: Axes, height: Any) -> None:
     """Draws a height map [H, W] m."""
-    grey = matplotlib.colormaps["Greys"]
-    image = _draw_map(cfg, axes, "Height map", 1e3 * np.asarray(height), grey)
+    values, grey = 1e3 * np.asarray(height), matplotlib.colormaps["Greys"]
+    image = _draw_map(cfg, axes, "Height map", values, grey)
     image.set_clim(0.0, TALLEST)
     axes.figure.colorbar(image, cax=axes.inset_axes(BAR), label="height, mm")
 
 
 def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Colormap) -> AxesImage:
-    """Draws a map of the workspace [H, W], axes in mm, y upwards."""
     half = 500.0 * cfg.heightmap.extent
     image = axes.imshow(values, cmap, origin="lower", extent=(-half, half) * 2)
     axes.set_title(title, fontsize="medium")
@@ -73,10 +73,7 @@ def _draw_map(cfg: Config, axes: Axes, title: str, values: np.ndarray, cmap: Col
 
 
 def draw_action(cfg: Config, axes: Axes, primitive: int, pose: Any) -> None:
-    """Draws a push as an arrow over its way, a grasp as fingers and the line they close along.
-
-    Args: pose (x m, y m, yaw rad).
-    """
+    """Draws a push as an arrow, a grasp as fingers and the line they close along."""
     x, y, yaw = np.asarray(pose, float)
     centre, along = 1e3 * np.array([x, y]), 1e3 * np.array([np.cos(yaw), np.sin(yaw)])
     style: dict[str, Any] = {"color": CHOSEN, "path_effects": OUTLINE}

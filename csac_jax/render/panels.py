@@ -19,7 +19,7 @@ CANDIDATES = {Primitive.PUSH: "#0072B2", Primitive.GRASP: "#CC79A7"}  # palette 
 LEARNED = {"left": 0.106, "right": 0.841, "bottom": 0.092, "top": 0.954, "wspace": 0.11}
 OTHERS = {"left": 0.142, "right": 0.809, "bottom": 0.208, "top": 0.792}  # edges of the maps
 
-# A scene's picture [H, W, 3] uint8 and a line of text -> the whole picture
+# A scene's picture [H, W, 3] uint8 and a line of text -> the whole picture.
 Frame = Callable[[np.ndarray, str], np.ndarray]
 
 
@@ -49,10 +49,9 @@ def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
         _draw_height_map(cfg, fig.subplots(gridspec_kw=OTHERS), step)
         return fig
     fig = heatmaps.figure(1.1 * height, height, height)
-    (push, grasp), (heights, legend) = fig.subplots(
-        2, 2, sharex=True, sharey=True, gridspec_kw=LEARNED
-    )
-    _draw_q_maps(cfg, (push, grasp), step)
+    q_axes, (heights, legend) = fig.subplots(2, 2, sharex=True, sharey=True, gridspec_kw=LEARNED)
+    heatmaps.draw_q_maps(cfg, q_axes, step.debug.q)
+    _draw_action(cfg, q_axes[int(step.action.primitive)], step)
     _draw_height_map(cfg, heights, step)
     handles, _ = heights.get_legend_handles_labels()
     handles.append(Patch(color=heatmaps.INVALID, label="nothing to act on"))
@@ -61,15 +60,7 @@ def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
     return fig
 
 
-def _draw_q_maps(cfg: Config, axes: tuple[Axes, Axes], step: StepRecord) -> None:
-    """Draws Q of both primitives, with the action in that of its primitive."""
-    assert step.debug is not None
-    heatmaps.draw_q_maps(cfg, axes, step.debug.q)
-    _draw_action(cfg, axes[int(step.action.primitive)], step)
-
-
 def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
-    """Draws the height map with the search's candidates and the chosen action."""
     heatmaps.draw_heights(cfg, axes, step.before.obs.height)
     if step.debug is not None:
         style: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.4, "zorder": 3}

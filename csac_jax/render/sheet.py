@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from csac_jax.objects.body import Object
-from csac_jax.render import media
+from csac_jax.render import heatmaps, media
 from csac_jax.vision import camera
 from csac_jax.world import blocks
 
@@ -24,25 +24,22 @@ def write(path: Path, objects: Sequence[Object]) -> None:
     shown = objects[:MOST]
     rows = math.ceil(len(shown) / _COLUMNS)
     figure = Figure(figsize=(_INCHES * _COLUMNS, 1.25 * _INCHES * rows), dpi=_DOTS)
-    canvas = FigureCanvasAgg(figure)
     reach = 0.4 * max(float(np.ptp(member.bounds, axis=0).max()) for member in shown)
     for number, member in enumerate(shown):
         axes = figure.add_subplot(rows, _COLUMNS, number + 1, projection="3d")
         _draw(axes, member, reach, blocks.COLOURS[number % len(blocks.COLOURS)])
     figure.subplots_adjust(0.0, 0.0, 1.0, 0.95, 0.0, 0.3)
-    canvas.draw()
-    media.write_picture(path, np.asarray(canvas.buffer_rgba())[..., :3])
+    media.write_picture(path, heatmaps.pixels(figure))
 
 
 def _draw(axes: Any, member: Object, reach: float, colour: np.ndarray) -> None:
-    """Draws one object, lit as in the pictures of height maps."""
     middle = member.bounds.mean(axis=0)
     corners = [part.vertices[part.triangles] - middle for part in member.parts]
     triangles = np.concatenate(corners)  # [T, 3, 3]
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    cosine = normal @ np.array(camera.LIGHT) / np.linalg.norm(normal, axis=1)
-    light = camera.AMBIENT + (1.0 - camera.AMBIENT) * np.maximum(cosine, 0.0)
-    faces = np.clip(light[:, None] * colour, 0.0, 1.0)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    lit = camera.shade(jnp.asarray(colour[None]), jnp.asarray(normal))
+    faces = np.clip(np.asarray(lit), 0.0, 1.0)
     axes.add_collection3d(Poly3DCollection(triangles, facecolors=faces))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), zlim=(-reach, reach))
     axes.set_box_aspect((1, 1, 1))

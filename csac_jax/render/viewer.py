@@ -8,7 +8,7 @@ import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -18,75 +18,51 @@ from csac_jax.render import gl, media
 PORT = 8080  # of the page, or the next free one
 CLOSING = 10.0  # s that a window may take to close
 _PLANE = 1.0  # half side of an endless plane as drawn, m
-_MESH = mujoco.mjtGeom.mjGEOM_MESH
 
-
-class Pictured(NamedTuple):
-    """An action to show."""
-
-    text: str  # its effect
-    poses: np.ndarray  # [T, ...] qpos
-
-
-class Showing(Protocol):
-    """A window or page that shows poses."""
-
-    def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose; returns False once the view is closed."""
+# Shows a pose and a line of text; returns False once the view is closed.
+Show = Callable[[mujoco.MjData, str], bool]
 
 
 def play(
     model: mujoco.MjModel,
-    actions: Sequence[Pictured],
+    actions: Sequence[tuple[str, np.ndarray]],
     log: Callable[[str], None],
     again: bool = True,
 ) -> None:
-    """Shows an episode, again and again until the window is closed or by Ctrl-C."""
-    opened = _window(model) if gl.has_display() else _page(model, log)
-    with contextlib.suppress(KeyboardInterrupt), opened as showing:
-        for _ in itertools.count() if again else range(1):
-            for action in actions:
-                if not _run(model, action, showing):
-                    return
-
-
-def _run(model: mujoco.MjModel, action: Pictured, showing: Showing) -> bool:
-    """Shows an action in the time that it takes; returns False once the view is closed."""
-    data = mujoco.MjData(model)
-    for pose in action.poses:
-        data.qpos[:] = pose
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_camlight(model, data)
-        if not showing.show(data, action.text):
-            return False
-        time.sleep(1.0 / media.FRAMES_PER_SECOND)
-    return True
-
-
-class _Window:
-    def __init__(self, handle: Any, data: mujoco.MjData) -> None:
-        self._handle, self._data = handle, data
-
-    def show(self, data: mujoco.MjData, text: str) -> bool:
-        with self._handle.lock():
-            self._data.qpos[:] = data.qpos
-            mujoco.mj_forward(self._handle.m, self._data)
-        self._handle.sync()
-        return bool(self._handle.is_running())
+    """Shows actions, texts and qpos [T, ...], again and again until closed or by Ctrl-C."""
+    opened, data = _window(model) if gl.has_display() else _page(model, log), mujoco.MjData(model)
+    turns = itertools.count() if again else range(1)
+    with contextlib.suppress(KeyboardInterrupt), opened as show:
+        for text, pose in (
+            (text, pose) for _ in turns for text, poses in actions for pose in poses
+        ):
+            data.qpos[:] = pose
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            if not show(data, text):
+                return
+            time.sleep(1.0 / media.FRAMES_PER_SECOND)
 
 
 @contextlib.contextmanager
-def _window(model: mujoco.MjModel) -> Iterator[Showing]:
+def _window(model: mujoco.MjModel) -> Iterator[Show]:
     import mujoco.viewer
 
-    data = mujoco.MjData(model)
+    shown, others = mujoco.MjData(model), set(threading.enumerate())
+
+    def show(data: mujoco.MjData, _: str) -> bool:
+        with handle.lock():
+            shown.qpos[:] = data.qpos
+            mujoco.mj_forward(model, shown)
+        handle.sync()
+        return bool(handle.is_running())
+
     panels = {"show_left_ui": False, "show_right_ui": False}
-    others = set(threading.enumerate())
     try:
-        with mujoco.viewer.launch_passive(model, data, **panels) as handle:
+        with mujoco.viewer.launch_passive(model, shown, **panels) as handle:
             handle.cam.lookat[:], handle.cam.distance = (0.0, 0.0, 0.05), 1.2
             handle.cam.azimuth, handle.cam.elevation = 45.0, -35.0
-            yield _Window(handle, data)
+            yield show
     finally:
         for thread in set(threading.enumerate()) - others:
             thread.join(CLOSING)  # Python's end closes GLFW, and crashes a window that still draws
@@ -97,7 +73,11 @@ class Page:
 
     def __init__(self, server: Any, model: mujoco.MjModel) -> None:
         server.scene.set_up_direction("+z")
-        server.on_client_connect(_look)
+
+        @server.on_client_connect
+        def _(client: Any) -> None:
+            client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
+
         self._text = server.gui.add_markdown("")
         self.parts = {}
         for geom in np.flatnonzero(model.geom_rgba[:, 3] > 0.0):
@@ -108,7 +88,7 @@ class Page:
             )
 
     def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose, see `Showing`; a page never closes."""
+        """Shows the model's pose; True, since a page never closes."""
         if self._text.content != text:
             self._text.content = text
         for geom, part in self.parts.items():
@@ -118,19 +98,14 @@ class Page:
         return True
 
 
-def _look(client: Any) -> None:
-    """Sets the first viewpoint of the page."""
-    client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
-
-
 @contextlib.contextmanager
-def _page(model: mujoco.MjModel, log: Callable[[str], None]) -> Iterator[Page]:
+def _page(model: mujoco.MjModel, log: Callable[[str], None]) -> Iterator[Show]:
     import viser
 
     server = viser.ViserServer(host="127.0.0.1", port=PORT, verbose=False)
     log(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends")
     try:
-        yield Page(server, model)
+        yield Page(server, model).show
     finally:
         server.stop()
 
@@ -140,26 +115,22 @@ def mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     import trimesh
 
     size, kind = model.geom_size[geom], mujoco.mjtGeom(int(model.geom_type[geom]))
-    if kind == _MESH:
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
         return _compiled_mesh(model, int(model.geom_dataid[geom]))
+    x, y, _ = np.where(size > 0.0, size, _PLANE)
     shapes = {
         mujoco.mjtGeom.mjGEOM_BOX: lambda: trimesh.creation.box(2.0 * size),
         mujoco.mjtGeom.mjGEOM_SPHERE: lambda: trimesh.creation.icosphere(radius=size[0]),
         mujoco.mjtGeom.mjGEOM_CYLINDER: lambda: trimesh.creation.cylinder(size[0], 2.0 * size[1]),
         mujoco.mjtGeom.mjGEOM_CAPSULE: lambda: trimesh.creation.capsule(2.0 * size[1], size[0]),
-        mujoco.mjtGeom.mjGEOM_PLANE: lambda: _plane(trimesh, size),
+        mujoco.mjtGeom.mjGEOM_PLANE: lambda: trimesh.creation.box(
+            bounds=((-x, -y, -0.002), (x, y, 0.0))  # its top is the plane
+        ),
     }
     if kind not in shapes:
         raise ValueError(f"geom {geom}: {kind.name} has no picture in the page")
     surface = shapes[kind]()
     return np.asarray(surface.vertices), np.asarray(surface.faces)
-
-
-def _plane(trimesh: Any, size: np.ndarray) -> Any:
-    """Makes a thin box whose top is the plane."""
-    half = np.where(size[:2] > 0.0, size[:2], _PLANE)
-    box = trimesh.creation.box((*(2.0 * half), 0.002))
-    return box.apply_translation((0.0, 0.0, -0.001))
 
 
 def _compiled_mesh(model: mujoco.MjModel, number: int) -> tuple[np.ndarray, np.ndarray]:

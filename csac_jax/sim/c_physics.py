@@ -1,7 +1,4 @@
-"""Primitives in C MuJoCo, the reference engine, on every core of the host.
-
-The compiled step calls it back. C MuJoCo examines all contacts; MJX keeps a fixed number of them.
-"""
+"""Primitives in C MuJoCo, the reference engine, on every core; the compiled step calls it back."""
 
 import contextlib
 import copy
@@ -32,10 +29,7 @@ _CALL_SUBSTEPS = 48  # per call of MuJoCo, ours: a longer call repeats more afte
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CPhysics:
-    """A world in C MuJoCo.
-
-    Raises ValueError for a world without touch sensors, such as one built for MJX.
-    """
+    """A world in C MuJoCo. Raises ValueError for one without touch sensors, as MJX has them."""
 
     world: World
     cfg: SimConfig
@@ -47,7 +41,7 @@ class CPhysics:
 
     @functools.cached_property
     def _key(self) -> str:
-        """Returns a digest of world, settings and MuJoCo; the same in every process."""
+        """Returns a digest of world, settings and MuJoCo, the same in every process."""
         identity = repr((self.world.digest, self.cfg, mujoco.__version__))
         return hashlib.sha256(identity.encode()).hexdigest()
 
@@ -58,7 +52,6 @@ class CPhysics:
 
     @contextlib.contextmanager
     def _simulator(self) -> Iterator["CSimulator"]:
-        """Provides a simulator that no other thread uses, if possible an idle one."""
         try:
             simulator = self._idle.pop()
         except IndexError:
@@ -70,13 +63,11 @@ class CPhysics:
         """Runs one primitive, see `physics.Physics`."""
         fields = model.scene_fields(self.world, scene)
         result = scene, outcome.nothing_seen(len(joints.control), len(self.world.slots))
-        arguments = (scene, fields, joints)
+        run = self._run_batch
+        call = functools.partial(jax.pure_callback, run, vmap_method="broadcast_all")
         if jax.default_backend() == "cpu" and jax.device_count() == 1:
-            moved, substeps = host_call.call(self._run_batch, self._key, result, *arguments)
-        else:
-            moved, substeps = jax.pure_callback(
-                self._run_batch, result, *arguments, vmap_method="broadcast_all"
-            )
+            call = functools.partial(host_call.call, run, self._key)
+        moved, substeps = call(result, scene, fields, joints)
         return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
 
     def _run_batch(self, *batch: Any) -> Any:
@@ -85,14 +76,12 @@ class CPhysics:
         axes = batch[-1].reachable.shape
         rows = [jax.tree.map(lambda leaf, i=i: leaf[i], batch) for i in np.ndindex(axes)]
         results = self._threads.map(self._run, *zip(*rows, strict=True))
-        return jax.tree.map(
-            lambda *leaves: np.stack(leaves).reshape((*axes, *np.shape(leaves[0]))), *results
-        )
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *results)
+        return jax.tree.map(lambda leaf: leaf.reshape((*axes, *leaf.shape[1:])), stacked)
 
     def _run(
         self, scene: SceneState, fields: BlockFields, joints: JointTrajectory
     ) -> tuple[SceneState, Substep]:
-        """Runs one scene. Returns it after the primitive, and its substeps, leaves [T, ...]."""
         world = self.world
         substeps = outcome.nothing_seen(len(joints.control), len(world.slots))
         inputs = scene.position, scene.quaternion, scene.velocity, joints.start, joints.control
@@ -100,29 +89,13 @@ class CPhysics:
         if not (finite and joints.reachable and scene.in_play.any()):
             return scene, substeps
         with self._simulator() as simulator:
-            qpos, qvel, sensed = _rollout(world, simulator, scene, fields, joints)
+            qpos, qvel, sensed = simulator.rollout(scene, fields, joints)
         last = qpos[-1].astype(np.float32), qvel[-1].astype(np.float32)
-        touching = sensed.reshape(substeps.touching.shape) > 0.0
-        rise = (qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2]).astype(np.float32)
-        gap = world.gripper.gap(qpos[:, world.finger_qpos]).astype(np.float32)
         moved = model_fields.moved(world, scene, *last)
+        touching = sensed.reshape(substeps.touching.shape) > 0.0
+        rise = np.float32(qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2])
+        gap = np.float32(world.gripper.gap(qpos[:, world.finger_qpos]))
         return moved, substeps.replace(touching=touching, rise=rise, gap=gap)
-
-
-class CSimulator:
-    """A MuJoCo model and data that one thread reuses for scene after scene.
-
-    Objects of many parts sleep: at rest they cost nothing until something that moves meets them.
-    """
-
-    def __init__(self, world: World) -> None:
-        self.model = copy.copy(world.model)  # holds the blocks of the last scene
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after a warning
-        if world.objects is not None:
-            self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
-            self.model.opt.sleep_tolerance = scene_state.STILL
-        self.data = mujoco.MjData(self.model)
-        self.engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
 
 class Trajectory(NamedTuple):
@@ -138,62 +111,67 @@ def trajectory(
 ) -> Trajectory:
     """Simulates one scene of NumPy arrays; returns no substep where the robot cannot follow."""
     if joints.reachable:
-        return _rollout(world, CSimulator(world), scene, fields, joints)
+        return CSimulator(world).rollout(scene, fields, joints)
     sizes = world.model.nq, world.model.nv, world.model.nsensordata
     return Trajectory(*(np.zeros((0, size)) for size in sizes))
 
 
-def _rollout(
-    world: World,
-    simulator: CSimulator,
-    scene: SceneState,
-    fields: BlockFields,
-    joints: JointTrajectory,
-) -> Trajectory:
-    """Simulates one scene. Parked blocks touch nothing and stay where they are."""
-    mj_model, parked = simulator.model, ~scene.in_play
-    is_parked = np.isin(world.slot_of_geom, np.flatnonzero(parked))
-    mj_model.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
-    mj_model.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
-    # MuJoCo derives the bodies' contact masks here: the geoms' come first.
-    model.with_blocks(world, fields, into=(mj_model, simulator.data))
-    mujoco.mj_resetData(mj_model, simulator.data)  # what slept in the last scene
-    start = np.concatenate([[0.0], world.model.qpos0, np.zeros(mj_model.nv)])
-    start[1 + world.robot_qpos] = joints.start
-    start[1 + world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    start[1 + mj_model.nq + world.block_dofs] = scene.velocity
-    speeds = 1 + mj_model.nq + world.block_dofs[scene.in_play]
-    states, sensed = _simulate(simulator, start, np.asarray(joints.control), speeds)
-    qpos, qvel = np.split(states[:, 1:], [mj_model.nq], axis=1)
-    waiting = world.block_qpos[parked]
-    qpos[:, waiting], qvel[:, world.block_dofs[parked]] = start[1 + waiting], 0.0  # they fell
-    return Trajectory(qpos, qvel, sensed)
+class CSimulator:
+    """A MuJoCo model and data that one thread reuses for scenes. Objects at rest sleep."""
 
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self.model = copy.copy(world.model)  # holds the blocks of the last scene
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after a warning
+        if world.objects is not None:
+            self.model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+            self.model.opt.sleep_tolerance = scene_state.STILL
+        self._data = mujoco.MjData(self.model)
+        self._engine = rollout.Rollout(nthread=0)  # MuJoCo's own loop, run in the calling thread
 
-def _simulate(
-    simulator: CSimulator, state: np.ndarray, control: np.ndarray, speeds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Steps from `state` by `control` [T, ...]; returns MuJoCo's states [T, 1 + nq + nv] and the
-    sensors [T, ...].
+    def rollout(
+        self, scene: SceneState, fields: BlockFields, joints: JointTrajectory
+    ) -> Trajectory:
+        """Simulates one scene. Parked blocks touch nothing and stay where they are."""
+        world, mj_model, parked = self._world, self.model, ~scene.in_play
+        is_parked = np.isin(world.slot_of_geom, np.flatnonzero(parked))
+        mj_model.geom_contype[:] = np.where(is_parked, 0, world.model.geom_contype)
+        mj_model.geom_conaffinity[:] = np.where(is_parked, 0, world.model.geom_conaffinity)
+        # MuJoCo derives the bodies' contact masks here: the geoms' come first.
+        model.with_blocks(world, fields, into=(mj_model, self._data))
+        mujoco.mj_resetData(mj_model, self._data)  # what slept in the last scene
+        start = np.concatenate([[0.0], world.model.qpos0, np.zeros(mj_model.nv)])
+        start[1 + world.robot_qpos] = joints.start
+        start[1 + world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+        start[1 + mj_model.nq + world.block_dofs] = scene.velocity
+        speeds = 1 + mj_model.nq + world.block_dofs[scene.in_play]
+        states, sensed = self._steps(start, np.asarray(joints.control), speeds)
+        qpos, qvel = np.split(states[:, 1:], [mj_model.nq], axis=1)
+        waiting = world.block_qpos[parked]
+        qpos[:, waiting], qvel[:, world.block_dofs[parked]] = start[1 + waiting], 0.0  # they fell
+        return Trajectory(qpos, qvel, sensed)
 
-    `speeds` [..., 6] are the places of block velocities in a state: after every substep they are
-    held to SPEED_LIMIT. MuJoCo's own loop cannot do that, so a call ends with the first substep
-    after which a block is too fast. The next call starts from the limited velocities and the
-    solver's warm start. That gives the bits of one loop, except that sleeping objects may wake.
-    """
-    mj_model, data = simulator.model, simulator.data
-    parts, done, ahead, warm = [], 0, _CALL_SUBSTEPS, np.zeros(mj_model.nv)
-    while done < len(control):
-        (states,), (sensed,) = simulator.engine.rollout(
-            mj_model, data, state, control[None, done : done + ahead], initial_warmstart=warm
-        )
-        too_fast = (np.abs(states[:, speeds]) > scene_state.SPEED_LIMIT).any(axis=(1, 2))
-        if too_fast[:-1].any():
-            ahead = int(np.argmax(too_fast)) + 1
-            continue
-        state, warm = states[-1], data.qacc_warmstart.copy()
-        state[speeds] = np.clip(state[speeds], -scene_state.SPEED_LIMIT, scene_state.SPEED_LIMIT)
-        parts.append((states, sensed))
-        done, ahead = done + len(states), 1 if too_fast[-1] else min(2 * ahead, _CALL_SUBSTEPS)
-    all_states, all_sensed = zip(*parts, strict=True)
-    return np.concatenate(all_states), np.concatenate(all_sensed)
+    def _steps(self, state: Any, control: np.ndarray, speeds: np.ndarray) -> list[np.ndarray]:
+        """Steps by `control` [T, ...]; returns states [T, 1 + nq + nv] and sensors [T, ...].
+
+        Velocities, at places `speeds` [..., 6] in a state, are held to SPEED_LIMIT after every
+        substep. MuJoCo's own loop cannot do that, so a call ends with the first substep after which
+        a block is too fast. The next one starts from the limited velocities and the solver's warm
+        start. That gives the bits of one loop, except that sleeping objects may wake.
+        """
+        most, warm = scene_state.SPEED_LIMIT, np.zeros(self.model.nv)
+        parts, done, ahead = [], 0, _CALL_SUBSTEPS
+        while done < len(control):
+            rows = control[None, done : done + ahead]
+            (states,), (sensed,) = self._engine.rollout(
+                self.model, self._data, state, rows, initial_warmstart=warm
+            )
+            too_fast = (np.abs(states[:, speeds]) > most).any(axis=(1, 2))
+            if too_fast[:-1].any():
+                ahead = int(np.argmax(too_fast)) + 1
+                continue
+            state, warm = states[-1], self._data.qacc_warmstart.copy()
+            state[speeds] = np.clip(state[speeds], -most, most)
+            parts.append((states, sensed))
+            done, ahead = done + len(states), 1 if too_fast[-1] else min(2 * ahead, _CALL_SUBSTEPS)
+        return [np.concatenate(leaves) for leaves in zip(*parts, strict=True)]

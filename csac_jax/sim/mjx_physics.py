@@ -47,10 +47,7 @@ class MjxPhysics:
 
 
 def make(world: World, cfg: SimConfig) -> MjxPhysics:
-    """Builds the physics of a world: MJX with its JAX implementation.
-
-    Raises SceneError for MJCF that MJX lacks code for.
-    """
+    """Builds the physics of a world. Raises SceneError for MJCF that MJX lacks code for."""
     try:
         mjx_model = mjx.put_model(world.model, impl="jax")
     except NotImplementedError as error:
@@ -59,7 +56,7 @@ def make(world: World, cfg: SimConfig) -> MjxPhysics:
 
 
 def scene_model(physics: MjxPhysics, scene: SceneState) -> mjx.Model:
-    """Returns the model with this scene's block sizes, masses and frictions."""
+    """Returns the model with this scene's blocks."""
     world, model = physics.world, physics.model
     fields = scene_fields(world, scene)
     meshes = [  # None for a mesh that no slot uses; `face` repeats the corners of the faces

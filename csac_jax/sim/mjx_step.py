@@ -26,8 +26,8 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 def repeated(contact: mjx.Contact) -> jax.Array:
     """Returns [C] bool, a contact repeats the place of an earlier one of the same two geoms.
 
-    MJX always gives four points for two boxes or meshes and fills up with copies. Each copy would
-    be one more soft constraint: a touch at one point would be four times as stiff.
+    MJX fills up to four points for two boxes or meshes with copies, each one more soft constraint:
+    a touch at one point would be four times as stiff.
     """
     offset = contact.pos[:, None] - contact.pos[None]  # [C, C, 3]
     same = jnp.all(jnp.abs(offset) < SAME_PLACE, axis=-1)

@@ -1,6 +1,7 @@
 """A scene as fields and state of MuJoCo's model, and back: what the engines share."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +16,22 @@ Base = Callable[[str], jax.Array]  # name of a model's field -> its values as co
 def of_scene(world: World, fields: BlockFields, base: Base) -> dict[str, jax.Array]:
     """Returns fields of the model with this scene's blocks and fingers, by name."""
     geoms, bodies, dofs = world.block_geoms, world.block_bodies, world.block_dofs
-    changed = {
-        "geom_size": base("geom_size").at[geoms].set(fields.size),
-        "geom_pos": base("geom_pos").at[geoms].set(fields.centre),
-        "geom_rbound": base("geom_rbound").at[geoms].set(fields.rbound),
-        "geom_friction": base("geom_friction").at[geoms, 0].set(fields.friction),
-        "body_mass": base("body_mass").at[bodies].set(fields.mass),
-        "body_inertia": base("body_inertia").at[bodies].set(fields.inertia),
-        "body_ipos": base("body_ipos").at[bodies].set(fields.com),
-        "body_invweight0": base("body_invweight0").at[bodies].set(fields.body_invweight),
-        "dof_invweight0": base("dof_invweight0").at[dofs].set(fields.dof_invweight),
+    values: dict[str, tuple[Any, jax.Array]] = {
+        "geom_size": (geoms, fields.size),
+        "geom_pos": (geoms, fields.centre),
+        "geom_rbound": (geoms, fields.rbound),
+        "geom_friction": ((geoms, 0), fields.friction),
+        "body_mass": (bodies, fields.mass),
+        "body_inertia": (bodies, fields.inertia),
+        "body_ipos": (bodies, fields.com),
+        "body_invweight0": (bodies, fields.body_invweight),
+        "dof_invweight0": (dofs, fields.dof_invweight),
     }
+    changed = {name: base(name).at[index].set(rows) for name, (index, rows) in values.items()}
     if fields.pads is not None:
-        pads, names = world.hand_geoms[1:], ("geom_size", "geom_pos", "geom_rbound")
-        for name, values in zip(names, fields.pads, strict=True):
-            changed[name] = changed[name].at[pads].set(values)
+        names = "geom_size", "geom_pos", "geom_rbound"
+        for name, pads in zip(names, fields.pads, strict=True):
+            changed[name] = changed[name].at[world.hand_geoms[1:]].set(pads)
     return changed
 
 

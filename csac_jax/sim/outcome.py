@@ -68,9 +68,8 @@ def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
 def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax.Array:
     """Judges by ground truth, returns Outcome [] int32, CSAC eq. 15.
 
-    `nothing`: the hand met no block on bare table. `empty`: it met none at a `surface` [] m above
-    BARE. `touched`: it met a block that never rose between the pads. `dropped`: a block rose and
-    was lost.
+    `nothing`: the hand met no block on bare table. `empty`: none at a `surface` [] m from BARE up.
+    `touched`: no block that it met rose between the pads. `dropped`: one rose and was lost.
     """
     dropped = trace.touched & jnp.any(trace.held_rise >= GRIP_RISE)
     lifted = jnp.any(lifted_blocks(trace, hand_rise))
@@ -78,10 +77,7 @@ def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax
 
 
 def grasp_outcome_by_gap(trace: Trace, surface: jax.Array, changed: jax.Array) -> jax.Array:
-    """Judges by finger gaps and height map, returns Outcome [] int32.
-
-    Args: changed [] bool, the height map moved.
-    """
+    """Judges by finger gaps, and by `changed` [] bool, the map moved; returns Outcome [] int32."""
     dropped, lifted = trace.gap_closed > CLOSED_GAP, trace.gap_end > CLOSED_GAP
     return _highest(surface >= BARE, changed, dropped, lifted)
 

@@ -21,11 +21,7 @@ class Physics(Protocol):
     """A world in which a robot can be moved."""
 
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
-        """Moves the robot, one set-point per substep. One scene; callers vmap.
-
-        Blocks that are not in play stay where they are. Blocks that end up in the hand are still
-        in play, hanging where the hand is.
-        """
+        """Moves the robot, one set-point per substep; blocks out of play stay. Callers vmap."""
 
 
 def _make_mjx(world: World, cfg: SimConfig) -> Physics:
@@ -51,10 +47,7 @@ def make(world: World, cfg: SimConfig) -> Physics:
 
 
 def prepare(physics: Physics, scenes: int) -> None:
-    """Prepares the first action of so many scenes, maybe in another thread.
-
-    Warp builds its kernels for minutes, or loads them, and records its substeps.
-    """
+    """Prepares the first action of so many scenes, for which Warp builds kernels for minutes."""
     if isinstance(physics, warp_physics.WarpPhysics):
         physics.simulator.prepared(scenes)
 
@@ -62,10 +55,7 @@ def prepare(physics: Physics, scenes: int) -> None:
 def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
-    """Runs one primitive. Nothing moves if the robot cannot follow the whole of it.
-
-    Args: height [H, W] m, the map the action was chosen from.
-    """
+    """Runs a primitive over the map `height` [H, W] m; nothing moves if the robot cannot follow."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
     after, trace = physics.run(scene, joints)
@@ -82,10 +72,7 @@ def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
 
 
 def healthy(scene: SceneState) -> jax.Array:
-    """Checks that every entry of a scene lies within its bounds, [] bool.
-
-    Bounds, not `isfinite`: physics may explode and stay finite. NaN fails every comparison.
-    """
+    """Returns [] bool, every entry of a scene lies within its bounds, which NaN does not."""
     reach = jnp.where(scene.in_play[:, None], 1.0, 100.0)  # m from the workspace centre
     speed = jnp.array([20.0, 20.0, 20.0, 200.0, 200.0, 200.0])  # m/s and rad/s
     length = jnp.sum(scene.quaternion**2, axis=1)

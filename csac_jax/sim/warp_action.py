@@ -1,9 +1,7 @@
 """All substeps of a primitive in many scenes, as one call on MuJoCo Warp's own arrays.
 
-Model and data of E scenes stay on the device. A call copies in the inputs of an action: fields of
-the blocks, state and set-points. After every substep, our kernels hold parked blocks, limit speeds
-and extend the trace. On CUDA several substeps are one recorded graph, launched until the primitive
-is over.
+Model and data of E scenes stay on the device; a call copies in fields of the blocks, state and
+set-points. On CUDA several substeps are one recorded graph.
 """
 
 import copy
@@ -28,7 +26,7 @@ STEP = 0.0051  # s, longest physics step; compared with C's in docs/benchmarks/p
 CONE_EFFORT = 8  # iterations of the solver and of a line search by elliptic cones: enough (ours)
 SPARE_SCENES = 32  # all scenes share their contacts: room for those of this many scenes more
 
-FIELDS = {
+FIELDS = {  # of MuJoCo's model, that differ per scene, [E, ...]
     "geom_size": wp.array2d[wp.vec3],
     "geom_pos": wp.array2d[wp.vec3],
     "geom_aabb": wp.array3d[wp.vec3],
@@ -41,18 +39,13 @@ FIELDS = {
     "body_invweight0": wp.array2d[wp.vec2],
     "dof_invweight0": wp.array2d[float],
 }
-"""Fields of MuJoCo's model that differ per scene, [E, ...]."""
-OBJECT_FIELDS = {
+OBJECT_FIELDS = {  # further ones, of objects
     "geom_dataid": wp.array2d[int],
     "geom_quat": wp.array2d[wp.quat],
     "body_iquat": wp.array2d[wp.quat],
 }
-"""Further fields that differ where there are objects."""
 _STATE = {"qpos": wp.array2d[float], "qvel": wp.array2d[float]}
-_COMMAND = {
-    "control": wp.array3d[float],  # [E, T, nu]
-    "in_play": wp.array2d[wp.bool],  # [E, N]
-}
+_COMMAND = {"control": wp.array3d[float], "in_play": wp.array2d[wp.bool]}  # [E, T, nu] and [E, N]
 _TRACE = {  # leaves of `outcome.Trace`; gaps are positions of the finger's joint
     "touched": wp.array[wp.bool],
     "held_rise": wp.array2d[float],
@@ -73,7 +66,6 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def _command(done: wp.array[int], control: wp.array3d[float], ctrl: wp.array2d[float]):
-    """Sets the set-points of the next substep and counts it as done."""
     scene = wp.tid()
     for actuator in range(ctrl.shape[1]):
         ctrl[scene, actuator] = control[scene, done[scene], actuator]
@@ -137,7 +129,7 @@ def _observe(
     gap_end: wp.array[float],
     contact_overflow: wp.array[float],
 ):
-    """Holds parked blocks, limits speeds, extends the trace (see _TRACE)."""
+    """Holds parked blocks, limits speeds, extends the trace, see _TRACE."""
     scene, slot = wp.tid()
     first = position[slot]
     dof = velocity[slot]
@@ -219,7 +211,6 @@ class Batch:
             wp.copy(target, result)
 
     def restart(self) -> None:
-        """Resets to the start of the last primitive."""
         data = self.data
         wp.copy(data.qpos, self._qpos)
         wp.copy(data.qvel, self._qvel)
@@ -261,8 +252,7 @@ def fields(world: World) -> dict[str, Any]:
 
 
 def steps(cfg: SimConfig) -> int:
-    """Returns the number of physics steps of a primitive: each at most STEP, a multiple of those in
-    a graph, but no more than the config's."""
+    """Counts a primitive's steps: at most STEP long, whole graphs, no more than the config's."""
     least = math.ceil(cfg.substeps * cfg.timestep / STEP - 1e-6)
     return min(cfg.substeps, -(-least // warp_graph.LONGEST) * warp_graph.LONGEST)
 
@@ -270,12 +260,10 @@ def steps(cfg: SimConfig) -> int:
 def _put(
     model: mujoco.MjModel, cfg: SimConfig, scenes: int, names: Iterable[str]
 ) -> tuple[Any, Any]:
-    """Makes Warp's model, whose fields `names` differ per scene, and its data.
-
-    NATIVECCD off: Warp takes C's function for two boxes, not the general one for convex shapes.
-    """
+    """Makes Warp's model, whose fields `names` differ per scene, and its data."""
     model = copy.copy(model)
     model.opt.timestep = cfg.substeps * cfg.timestep / steps(cfg)
+    # Off: Warp takes C's function for two boxes, not the general one for convex shapes.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     # Warp refuses both, which C has with objects: the flag, and dense Jacobians of many blocks.
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
@@ -296,11 +284,8 @@ def _put(
 
 
 class WarpSimulator:
-    """A function of the arrays of E scenes, for JAX to call.
-
-    It takes FIELDS, with objects OBJECT_FIELDS too, qpos [E, nq], qvel [E, nv], control [E, T, nu]
-    and in_play [E, N] by these names. It returns qpos, qvel and the leaves of `outcome.Trace`.
-    """
+    """A function of the arrays of E scenes by name, `arguments`, for JAX to call. It returns qpos
+    [E, nq], qvel [E, nv] and the leaves of `outcome.Trace`."""
 
     def __init__(self, world: World, cfg: SimConfig) -> None:
         self.substeps = steps(cfg)
@@ -316,7 +301,6 @@ class WarpSimulator:
         )
 
     def __call__(self, **arrays: jax.Array) -> dict[str, jax.Array]:
-        """Runs one primitive and returns the results by name."""
         model, (scenes, slots) = self._world.model, arrays["in_play"].shape
         shapes = {name: (scenes, slots)[: kind.ndim] for name, kind in _TRACE.items()}
         shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}

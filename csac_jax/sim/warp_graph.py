@@ -15,10 +15,7 @@ LONGEST = 10  # most steps in one recorded graph
 
 
 def repeated(step: Callable[[], None], times: int) -> Callable[[], None]:
-    """Returns a function that runs `step` so many times, on CUDA as graphs; runs it once here.
-
-    The step must launch and allocate the same whenever it is run.
-    """
+    """Returns a function that runs `step`, always the same launches, so many times."""
     _load_kernels(step)  # a recording must not load any
     arrays: list[wp.array] = []
 
@@ -46,10 +43,9 @@ def _repeat(call: Callable[[], None], times: int) -> None:
 
 
 def _load_kernels(step: Callable[[], None]) -> None:
-    """Builds and loads the kernels that `step` launches, on all cores.
+    """Builds and loads the kernels that `step` launches, on all cores: one by one takes minutes.
 
-    A launch would load its own kernel alone; built one by one they take minutes. So does a query
-    for the best block size, which is replaced here.
+    So does a query for the best block size, which is replaced here.
     """
     modules: dict[int, dict[Any, None]] = {}
 
@@ -67,10 +63,7 @@ def _load_kernels(step: Callable[[], None]) -> None:
 
 @contextlib.contextmanager
 def _allocated_once(arrays: list[wp.array]) -> Iterator[None]:
-    """Makes Warp hand out the arrays of the last such block again, one after the other.
-
-    A recorded graph would allocate and free each of them in every step.
-    """
+    """Makes Warp hand out the arrays of the last such block again, for a graph to keep."""
     places, make = itertools.count(), {name: getattr(wp, name) for name in ("empty", "empty_like")}
 
     def hand_out(name: str, *args: Any, **kwargs: Any) -> wp.array:

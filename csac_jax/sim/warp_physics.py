@@ -1,7 +1,6 @@
 """Primitives on MuJoCo Warp: all substeps of many scenes are one call, see `warp_action`.
 
-Meshes of blocks have one size in all scenes; those of objects differ. Results are not repeatable
-bit for bit. Set-points are read at Warp's own times, see `warp_action.STEP`.
+Meshes of blocks have one size in all scenes. Results are not repeatable bit for bit.
 """
 
 import dataclasses
@@ -30,8 +29,7 @@ class WarpPhysics:
     """A world on Warp; a batch of scenes stays on the device after its first use."""
 
     world: World
-    simulator: Any
-    """`warp_action.WarpSimulator`"""
+    simulator: Any  # `warp_action.WarpSimulator`
 
     @functools.cached_property
     def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
@@ -91,7 +89,6 @@ def _flat_vmap(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _model_fields(world: World, scene: SceneState) -> dict[str, jax.Array]:
-    """Returns the model's fields with this scene's block sizes, masses and frictions."""
     model, fields = world.model, scene_fields(world, scene)
     geoms, bodies = world.block_geoms, world.block_bodies
 
@@ -123,11 +120,7 @@ def _bounds(half: jax.Array) -> jax.Array:
 def _of_objects(
     world: World, objects: Bodies, fields: ObjectFields
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yields names of the model's fields, the places of objects in them and a scene's values.
-
-    Parts that an object lacks have no mesh. A body's frame is at its centre of mass, so that a push
-    there does not turn it: its inverse weights are 1/m and the mean of 1/I.
-    """
+    """Yields names of the model's fields, the places of objects in them and a scene's values."""
     number, (bodies, geoms) = fields.number, (objects.bodies, objects.geoms)
 
     def known(rows: np.ndarray) -> jax.Array:
@@ -147,7 +140,7 @@ def _of_objects(
     yield "body_mass", bodies, mass
     yield "body_inertia", bodies, inertia
     yield "body_iquat", bodies, known(objects.tables.axes)
-    yield "body_ipos", bodies, 0.0
+    yield "body_ipos", bodies, 0.0  # so a push there does not turn it: 1/m and the mean of 1/I
     weights = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=1)], axis=1)
     yield "body_invweight0", bodies, weights
     yield "dof_invweight0", world.block_dofs[objects.slots], jnp.repeat(weights, 3, axis=1)

@@ -1,7 +1,7 @@
 """A pinhole camera: depth and colour images, and pixels as points in space.
 
-The camera looks along its z, x is right and y down in the image; row 0 is the top row. Depth is
-along z. A pixel's ray is not of unit length: it advances by 1 m in depth per unit of distance.
+The camera looks along its z, x is right and y down in the image; row 0 is the top row. A pixel's
+ray is not of unit length: it advances by 1 m in depth, along z, per unit of distance.
 
     eye = camera.make(CameraConfig().scaled(0.5))
     picture = camera.render(eye, solids.place(geoms.read(model), data.geom_xpos, data.geom_xmat))
@@ -40,11 +40,11 @@ class Camera:
 
 @struct.dataclass
 class Picture:
-    """An image of a camera. H, W = rows and columns."""
+    """An image of a camera."""
 
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     depth: jax.Array  # [H, W] float32 m, along the optical axis; 0 where not valid
-    geom: jax.Array  # [H, W] int32, `Hit.geom`; meaningless where not valid
+    geom: jax.Array  # [H, W] int32, `Hit.geom`
     valid: jax.Array  # [H, W] bool, True if the pixel sees anything
 
 
@@ -92,12 +92,11 @@ def project(camera: Camera, point: jax.Array) -> jax.Array:
 
 @functools.lru_cache(maxsize=64)
 def window(cfg: CameraConfig, extent: float, highest: float, radius: float) -> tuple[int, int]:
-    """Returns rows and columns of a window that holds any ball of `radius` m in the image.
+    """Returns rows and columns of a window, at most the image, that holds any ball of `radius` m.
 
     The ball's centre lies over the square of side `extent` m, at most `highest` m high, and
     projects to the window's centre. In the plane of an image axis and the optical axis, a ball at
-    angle a and distance d lies between a - s and a + s with sin s = radius / d. The window is at
-    most the image.
+    angle a and distance d lies between a - s and a + s with sin s = radius / d.
     """
     with jax.ensure_compile_time_eval():
         eye = jax.device_get(make(cfg))

@@ -1,13 +1,10 @@
 """Errors of a depth camera on an exact depth image: noise, steps, holes, mixed pixels.
 
 It works in inverse depth, w = 1 / z: a stereo camera's disparity is f b w, and a plane is linear in
-the image. Errors of w that do not depend on w are errors of z that grow with z^2.
-
-Sources:
+the image. Errors of w that do not depend on w are errors of z that grow with z^2. Sources:
 [1] Grunnet-Jepsen, Sweetser and Woodfill, "Tuning depth cameras for best performance", Intel: the
     best resolutions; RMS error of depth z^2 subpixel / (f b); 126 disparities are searched.
-[2] Grunnet-Jepsen et al., "Subpixel linearity improvement for Intel RealSense depth cameras":
-    fields of view.
+[2] Grunnet-Jepsen et al., "Subpixel linearity improvement for RealSense depth cameras": views.
 [3] Intel RealSense D400 series data sheet: baselines.
 [4] librealsense, issue 3904: subpixel error of 0.08 px.
 [5] Keselman et al., CVPR workshops 2017, "Intel RealSense stereoscopic depth cameras": 5 bits of
@@ -79,8 +76,7 @@ def measure(
 
     Half of the pixels at edges have no depth. Nor have surfaces that are dark, at a flat angle,
     hidden from the second viewpoint, too near or too far. The returned light is
-    lightness cos(angle). Edges are at least 1 px wide to both sides. Multiple reflections, sunlight
-    and errors that stay from image to image are left out.
+    lightness cos(angle). Multiple reflections, sunlight and lasting errors are left out.
 
     Args: exact [h, w] m along the optical axis; valid [h, w] bool, the ray hit anything; lightness
     [h, w], share of the light that the surface scatters; eye, whose intrinsics count.
@@ -89,7 +85,8 @@ def measure(
     radius = max(1, round(camera.window * eye.focal[0]))
     inverse = jnp.where(valid, 1.0 / jnp.where(valid, exact, 1.0), 0.0)  # [h, w] 1/m
     around = _shifted(inverse, radius)
-    edge = _bend(inverse, around) > JUMP * inverse**2
+    bends = jnp.abs(around[::2] + around[1::2] - 2.0 * inverse[None])  # [2, h, w], 0 on a plane
+    edge = jnp.max(bends, axis=0) > JUMP * inverse**2
     cosine = _cosine(eye, inverse, around, radius)
     draw = jax.random.uniform(key_edge, exact.shape)
     mixed = edge & (draw >= LOST) & (draw < LOST + FLYING)
@@ -104,41 +101,25 @@ def measure(
 
 
 def supported(depth: jax.Array, focal: Any) -> jax.Array:
-    """Returns [h, w] bool, SUPPORT or more of a pixel's eight neighbours have its depth: a pixel
-    with a depth that does not fly.
-
-    Args: depth [h, w] m, 0 without a depth; focal, px.
-    """
+    """Returns [h, w] bool, a pixel does not fly: SUPPORT or more of its eight neighbours have its
+    depth [h, w] m, 0 without one. `focal` is in px."""
     reach = depth * jnp.maximum(NEAR, 3.0 / focal)
-    padded, size = jnp.pad(depth, 1), depth.shape
-    neighbours = [
-        jax.lax.dynamic_slice(padded, (row, col), size)
-        for row, col in itertools.product(range(3), repeat=2)
-        if (row, col) != (1, 1)
-    ]
+    starts = [start for start in itertools.product(range(3), repeat=2) if start != (1, 1)]
+    neighbours = [jax.lax.dynamic_slice(jnp.pad(depth, 1), at, depth.shape) for at in starts]
     alike = [(jnp.abs(other - depth) < reach).astype(jnp.int32) for other in neighbours]
     return functools.reduce(jnp.add, alike) >= SUPPORT
 
 
 def _shifted(inverse: jax.Array, radius: int) -> jax.Array:
-    """Returns the pixels `radius` to the right, left, below and above [4, h, w]; edges repeat."""
+    """Returns the pixels to the right, left, below and above [4, h, w]; edges repeat."""
     padded, size = jnp.pad(inverse, radius, mode="edge"), inverse.shape
     starts = ((radius, 2 * radius), (radius, 0), (2 * radius, radius), (0, radius))
     return jnp.stack([jax.lax.dynamic_slice(padded, start, size) for start in starts])
 
 
-def _bend(inverse: jax.Array, around: jax.Array) -> jax.Array:
-    """Returns the distance of inverse depths [h, w] 1/m from a plane's; 0 on one."""
-    right, left, below, above = around
-    along, across = jnp.abs(right + left - 2.0 * inverse), jnp.abs(below + above - 2.0 * inverse)
-    return jnp.maximum(along, across)
-
-
 def _cosine(eye: CameraConfig, inverse: jax.Array, around: jax.Array, radius: int) -> jax.Array:
-    """Returns the cosine [h, w] of the angle between a surface's normal and the pixel's ray.
-
-    On the plane n . p = 1 the pixel (x, y, 1) has the inverse depth n . (x, y, 1).
-    """
+    """Returns the cosine [h, w] of the angle between a surface's normal and the pixel's ray."""
+    # On the plane n . p = 1 the pixel (x, y, 1) has the inverse depth n . (x, y, 1).
     right, left, below, above = around
     rows, cols = inverse.shape
     x = ((jnp.arange(cols, dtype=jnp.float32) - eye.centre[0]) / eye.focal[0])[None]

@@ -1,7 +1,4 @@
-"""Height maps of one scene seen from above: the observation, its packed form, an area.
-
-Rows run along y and columns along x, see `geometry`.
-"""
+"""Height maps of one scene seen from above: the observation, its packed form, an area."""
 
 from typing import NamedTuple
 
@@ -18,7 +15,7 @@ _AS_HIGH = 1e-6  # m; points that are less below the highest count as it
 
 @struct.dataclass
 class Observation:
-    """One scene seen from above. H = W rows and columns of the map."""
+    """One scene seen from above. H = W rows and columns of the map, see `geometry`."""
 
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     height: jax.Array  # [H, W] float32, m above the table
@@ -32,8 +29,8 @@ class PackedObservation:
 
     colour: jax.Array  # [H, W, 3] uint8, 255 = 1
     height: jax.Array  # [H, W] uint16, tenths of a millimetre above the table
-    target: jax.Array  # [H, W] bool, as in Observation
-    fingers: jax.Array | None = None  # [3] float32 m, likewise
+    target: jax.Array  # [H, W] bool
+    fingers: jax.Array | None = None  # [3] float32 m
 
 
 class Cells(NamedTuple):
@@ -61,23 +58,19 @@ def from_points(cfg: HeightmapConfig, points: jax.Array, valid: jax.Array) -> Ce
     index = jnp.arange(len(points), dtype=jnp.int32)
     last = jnp.full(cfg.size**2, jnp.int32(len(points) - 1))
     source = last.at[jnp.where(is_top, cell, cfg.size**2)].min(index, mode="drop")
-    leaves = (jnp.maximum(top, 0.0), source, top > -jnp.inf)
-    return Cells(*(leaf.reshape(cfg.size, cfg.size) for leaf in leaves))
+    cells = Cells(jnp.maximum(top, 0.0), source, top > -jnp.inf)
+    return jax.tree.map(lambda leaf: leaf.reshape(cfg.size, cfg.size), cells)
 
 
 def observation(
     cells: Cells, colour: jax.Array, target: jax.Array, elsewhere: jax.Array
 ) -> Observation:
-    """Makes the observation of the highest points; cells without one have height and colour 0.
+    """Makes the observation of the points' `colour` [H, W, 3] and `target` [H, W] bool.
 
-    Args: colour [H, W, 3] and target [H, W] bool of each cell's point, see `Cells.source`;
-    elsewhere [] bool, the target flag of cells without one.
+    Cells without a point have height and colour 0 and the target flag `elsewhere` [] bool.
     """
-    return Observation(
-        colour=jnp.where(cells.filled[..., None], colour, 0.0),
-        height=cells.height,
-        target=jnp.where(cells.filled, target, elsewhere),
-    )
+    shown = jnp.where(cells.filled[..., None], colour, 0.0)
+    return Observation(shown, cells.height, jnp.where(cells.filled, target, elsewhere))
 
 
 def pack(obs: Observation) -> PackedObservation:

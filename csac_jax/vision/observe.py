@@ -1,11 +1,8 @@
-"""From the state of one scene to its observation.
+"""From the state of one scene to its observation, with a key and sensor noise if wished.
 
-There are two views (`HeightmapConfig.view`). `ortho` is complete: one ray straight down per cell.
-`oblique` is the depth image of a camera at the side, its points projected along gravity as in VPG
-(arXiv:1803.09956); hidden cells are empty. With a key, either has sensor noise.
-
-A surface is a face of a geom or the table, numbered as in `raycast.SurfaceHit`. S = surfaces, G =
-geoms, [h, w] = camera pixels.
+`HeightmapConfig.view` `ortho` is complete: one ray straight down per cell. `oblique` is the depth
+image of a camera at the side, its points projected along gravity as in VPG (arXiv:1803.09956);
+hidden cells are empty. S = surfaces, see `raycast.SurfaceHit`, G = geoms, [h, w] = camera pixels.
 """
 
 import math
@@ -50,14 +47,14 @@ class Shapes(NamedTuple):
 def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
     """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`."""
     shapes = scene_shapes(cfg.scene, scene)
-    tables = scene_tables(cfg.scene, scene, shapes, _light(cfg.sensor, key))
-    if cfg.heightmap.view == "ortho":
-        exact = ortho(cfg.heightmap, shapes, tables)
-        return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
-    believed = camera.make(cfg.camera)
-    if key is not None:
-        return oblique_noisy(key, cfg, shapes, tables, believed)
-    return from_pixels(cfg.heightmap, believed, cast_pixels(cfg, believed, shapes), tables)
+    light: Any = camera.LIGHT
+    if key is not None and cfg.sensor.light > 0.0:
+        light = sensor.light(jax.random.fold_in(key, _LIGHT), cfg.sensor)
+    tables = scene_tables(cfg.scene, scene, shapes, light)
+    if cfg.heightmap.view == "oblique":
+        return oblique(cfg, shapes, tables, key)
+    exact = ortho(cfg.heightmap, shapes, tables)
+    return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
 
 
 def scene_shapes(cfg: SceneConfig, scene: SceneState) -> Shapes:
@@ -80,10 +77,8 @@ def polytopes(slots: tuple[SlotKind, ...], scene: SceneState) -> Polytopes:
 def _objects(cfg: SceneConfig, scene: SceneState) -> ObjectShapes:
     known, slot = object_slots.table(cfg), np.flatnonzero(blocks.is_object(cfg.slots))  # [M]
     number = scene.numbers[slot]
-    normal, offset, first, centre = (
-        jnp.asarray(leaf)[number]
-        for leaf in (known.normal, known.offset, known.first, known.centre)
-    )
+    leaves = known.normal, known.offset, known.first, known.centre
+    normal, offset, first, centre = (jnp.asarray(leaf)[number] for leaf in leaves)
     position = scene.position[slot]
     rotation = jax.vmap(geometry.quat_to_matrix)(scene.quaternion[slot])  # [M, 3, 3]
     # Products and sums, as in `raycast.world_half_spaces`.
@@ -96,13 +91,6 @@ def _objects(cfg: SceneConfig, scene: SceneState) -> ObjectShapes:
         jnp.asarray(blocks.COLOURS)[scene.colour[slot]],
         known.radius,
     )
-
-
-def _light(noise: SensorConfig, key: jax.Array | None) -> Any:
-    """Returns the unit vector [3] towards the light."""
-    if key is None or noise.light == 0.0:
-        return camera.LIGHT
-    return sensor.light(jax.random.fold_in(key, _LIGHT), noise)
 
 
 def scene_tables(
@@ -140,35 +128,26 @@ def surface_tables(
 
 
 def ortho(cfg: HeightmapConfig, shapes: Shapes, tables: SurfaceTables) -> Observation:
-    """Observes from above: one ray from VIEW_HEIGHT through every cell centre.
-
-    The direction has no ray axis under vmap, so a plane costs one scalar product per ray.
-    """
-    height = jnp.full((cfg.size, cfg.size, 1), VIEW_HEIGHT, jnp.float32)
-    origin = jnp.concatenate([geometry.cell_centres(cfg), height], axis=-1).reshape(-1, 3)
+    """Observes from above: one ray from VIEW_HEIGHT through every cell centre."""
     down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
-    cast = jax.vmap(raycast.cast_polytopes, in_axes=(None, 0, None))
-    hits = SurfaceHit(*(leaf.reshape(cfg.size, -1) for leaf in cast(shapes.blocks, origin, down)))
-    if shapes.objects is not None:
-        hits = _objects_below(cfg, shapes.objects, hits, shapes.first)
-    colour, target = (table.at[hits.surface].get(mode="promise_in_bounds") for table in tables)
-    return Observation(colour, jnp.maximum(VIEW_HEIGHT - hits.distance, 0.0), target)
-
-
-def _objects_below(
-    cfg: HeightmapConfig, objects: ObjectShapes, hits: SurfaceHit, first: int
-) -> SurfaceHit:
-    """Adds objects to the hits of rays straight down; their surfaces count from `first`."""
-    down = jnp.array([0.0, 0.0, -1.0], jnp.float32)
-    side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
-    low = objects.centre[:, 1::-1] - objects.radius  # y, x
-    corner = jnp.floor((low + 0.5 * cfg.extent) / cfg.cell)
 
     def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         x, y = ((i.astype(jnp.float32) - 0.5 * (cfg.size - 1)) * cfg.cell for i in (columns, rows))
         return jnp.stack([x, y, jnp.full_like(x, VIEW_HEIGHT)], axis=-1), down
 
-    return _windows(objects, hits, corner, (side, side), ray, first)
+    numbers = jnp.arange(cfg.size, dtype=jnp.int32)
+    origin, _ = ray(*jnp.meshgrid(numbers, numbers, indexing="ij"))
+    # The direction has no ray axis, so a plane costs one scalar product per ray.
+    cast = jax.vmap(raycast.cast_polytopes, in_axes=(None, 0, None))
+    hits = cast(shapes.blocks, origin.reshape(-1, 3), down)
+    hits = SurfaceHit(*(leaf.reshape(cfg.size, -1) for leaf in hits))
+    if (objects := shapes.objects) is not None:
+        side = min(math.ceil(2.0 * objects.radius / cfg.cell) + 1, cfg.size)
+        low = objects.centre[:, 1::-1] - objects.radius  # y, x
+        corner = jnp.floor((low + 0.5 * cfg.extent) / cfg.cell)
+        hits = raycast.cast_windows(objects, hits, corner, (side, side), ray, shapes.first)
+    colour, target = (table.at[hits.surface].get(mode="promise_in_bounds") for table in tables)
+    return Observation(colour, jnp.maximum(VIEW_HEIGHT - hits.distance, 0.0), target)
 
 
 def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
@@ -184,27 +163,13 @@ def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
     def ray(rows: jax.Array, columns: jax.Array) -> tuple[jax.Array, jax.Array]:
         return eye.position, camera.direction(eye, rows, columns)
 
-    return _windows(objects, hits, corner, side, ray, shapes.first)
-
-
-def _windows(
-    objects: ObjectShapes,
-    hits: SurfaceHit,
-    corner: jax.Array,
-    side: tuple[int, int],
-    ray: raycast.Ray,
-    first: int,
-) -> SurfaceHit:
-    """Casts objects' windows, with corners [M, 2], whole numbers, moved into the grid."""
-    most = np.array(hits.distance.shape) - side
-    inside = jnp.clip(corner, 0.0, jnp.asarray(most, jnp.float32)[None]).astype(jnp.int32)
-    return raycast.cast_windows(objects, hits, inside, side, ray, first)
+    return raycast.cast_windows(objects, hits, corner, side, ray, shapes.first)
 
 
 def ortho_noisy(
     key: jax.Array, noise: SensorConfig, exact: Observation, tables: SurfaceTables
 ) -> Observation:
-    """Adds the noise of a depth sensor at VIEW_HEIGHT; cells without a depth are empty."""
+    """Adds the noise of a sensor at VIEW_HEIGHT; cells without a depth are empty."""
     key_depth, key_colour = jax.random.split(key)
     depth, valid = sensor.depth(key_depth, noise, VIEW_HEIGHT - exact.height)
     colour = jnp.where(valid[..., None], exact.colour, 0.0)
@@ -226,17 +191,19 @@ def from_pixels(
     return heightmap.observation(cells, colour, target, tables.is_target[0])
 
 
-def oblique_noisy(
-    key: jax.Array, cfg: Config, shapes: Shapes, tables: SurfaceTables, believed: Camera
+def oblique(
+    cfg: Config, shapes: Shapes, tables: SurfaceTables, key: jax.Array | None
 ) -> Observation:
-    """Observes with sensor noise and without flying pixels; the real camera is a little off."""
+    """Observes by a camera; with a key the real one is a little off and its image has noise."""
+    believed = camera.make(cfg.camera)
+    if key is None:
+        return from_pixels(cfg.heightmap, believed, cast_pixels(cfg, believed, shapes), tables)
     key_pose, key_depth, key_colour = jax.random.split(key, 3)
-    real = sensor.pose(key_pose, cfg.sensor, believed)
-    hits = cast_pixels(cfg, real, shapes)
+    hits = cast_pixels(cfg, sensor.pose(key_pose, cfg.sensor, believed), shapes)
     exact = jnp.where(hits.valid, hits.distance, 0.0)
     lit = tables.colour.at[hits.surface].get(mode="promise_in_bounds")
     depth, valid = sensor.depths(key_depth, cfg.sensor, cfg.camera, exact, hits.valid, lit)
-    if cfg.sensor.kind != "none":
+    if cfg.sensor.kind != "none":  # without flying pixels
         valid &= depth_camera.supported(jnp.where(valid, depth, 0.0), cfg.camera.focal[0])
     hits = hits._replace(distance=depth, valid=valid)
     obs = from_pixels(cfg.heightmap, believed, hits, tables)

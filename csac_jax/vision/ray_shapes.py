@@ -38,19 +38,16 @@ def dot(a: Vector, b: Vector) -> jax.Array:
 def enter_half_spaces(
     normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Intersects one ray with one intersection of half-spaces (slab method, Kay and Kajiya 1986).
+    """Intersects one ray with half-spaces, normals [F, 3] and offsets [F] m (slab method, Kay and
+    Kajiya 1986). Returns distance, face int32 and bool, the ray enters, all []; see `RayHit`.
 
     t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
     leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
     never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
     that share a direction share the division.
-
-    Args: normal [F, 3] and offset [F] m; origin [3] m, direction [3].
-    Returns: distance, face int32 and bool, the ray enters, all []; see `RayHit`.
     """
-    enter, leave = jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32)
-    start = enter, leave, jnp.array(0, jnp.int32)
-    enter, leave, face = clip(normal, offset, origin, direction, *start, 0)
+    whole = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
+    enter, leave, face = clip(normal, offset, origin, direction, whole, 0)
     return enter, face, (enter >= 0.0) & (enter <= leave)
 
 
@@ -59,12 +56,11 @@ def clip(
     offset: jax.Array,
     origin: Vector,
     direction: Vector,
-    enter: jax.Array,
-    leave: jax.Array,
-    face: jax.Array,
+    part: tuple[jax.Array, jax.Array, jax.Array],
     first: jax.Array | int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cuts a ray's part from `enter` to `leave` by half-spaces, numbered from `first`. All []."""
+    """Cuts a ray's part (enter, leave, face), all [], by half-spaces, numbered from `first`."""
+    enter, leave, face = part
     for f in range(normal.shape[0]):
         speed = dot(normal[f], direction)
         inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)

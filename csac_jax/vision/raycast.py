@@ -1,8 +1,7 @@
 """One ray against the table and convex blocks, or against geoms of any kind; callers vmap.
 
 Faces and geoms are folded one after another, so vmap forms no [R, G, F] array. Half-spaces in the
-world frame have no ray axis under `vmap(cast, in_axes=(None, 0, 0))`: they are computed once per
-scene.
+world frame have no ray axis under `vmap(cast, in_axes=(None, 0, 0))`.
 """
 
 import functools
@@ -11,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from csac_jax.vision import ray_shapes
@@ -24,8 +24,7 @@ Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 class Polytopes:
     """Convex blocks of one scene. G geoms, F faces of the one with the most.
 
-    Unused faces have a zero normal and a positive offset: they bound nothing. A geom that has only
-    such faces is never hit.
+    Unused faces have a zero normal and a positive offset. A geom of only such faces is never hit.
     """
 
     normal: jax.Array  # [G, F, 3] outward unit normals, body frame
@@ -61,9 +60,9 @@ class Hit:
 class SurfaceHit(NamedTuple):
     """First hit of one ray. Surfaces: 0 the table, 1 + g F + f face f of geom g, then objects."""
 
-    distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
+    distance: jax.Array  # [] as in Hit
     surface: jax.Array  # [] int32; 0 where not valid
-    valid: jax.Array  # [] bool, True if the ray hits anything
+    valid: jax.Array  # [] bool
 
 
 def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
@@ -82,8 +81,7 @@ def surface_normals(polytopes: Polytopes) -> jax.Array:
 def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
     """Finds the first surface on the ray from `origin` [3] m along `direction` [3], any length.
 
-    Read colours and normals of a hit from a table of surfaces: computing the normal alone for every
-    ray takes longer than finding the surface.
+    Read colours and normals of a hit from a table of surfaces: computing them per ray is slower.
     """
     normal, offset = world_half_spaces(polytopes)
     geoms, faces = offset.shape
@@ -119,14 +117,13 @@ def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) ->
         nearest, part = carry
         normal, offset, first, number = chunk
         nearest = ended(nearest, part, first)
-        enter, leave, face = jax.tree.map(functools.partial(jnp.where, first), outside, part)
-        ray = origin, direction
-        part = ray_shapes.clip(normal, offset, *ray, enter, leave, face, number * faces)
+        part = jax.tree.map(functools.partial(jnp.where, first), outside, part)
+        part = ray_shapes.clip(normal, offset, origin, direction, part, number * faces)
         return (nearest, part), None
 
-    no_face = jnp.array(0, jnp.int32)
-    outside: Any = (jnp.array(-jnp.inf, jnp.float32), jnp.array(jnp.inf, jnp.float32), no_face)
-    start: Any = ((jnp.array(jnp.inf, jnp.float32), no_face), outside)
+    far, no_face = jnp.float32(jnp.inf), jnp.int32(0)
+    outside: Any = (jnp.float32(-jnp.inf), far, no_face)
+    start: Any = ((far, no_face), outside)
     rows = (objects.normal, objects.offset, objects.first, jnp.arange(chunks, dtype=jnp.int32))
     (nearest, last), _ = jax.lax.scan(fold_chunk, start, rows)
     distance, face = ended(nearest, last, jnp.array(True))
@@ -143,11 +140,12 @@ def cast_windows(
 ) -> SurfaceHit:
     """Adds objects to the hits [h, w] of a grid of rays; each is tested on a window of rays only.
 
-    A window must hold all rays that meet its object. Its shape is known at compile time.
-
-    Args: corner [M, 2] int32, first row and column of each object's window, which lies in the grid;
-    side, its rows and columns; ray, see `Ray`; first, number of the objects' first surface.
+    Args: corner [M, 2], whole numbers, first row and column of each object's window, which is moved
+    into the grid and holds all rays that meet the object; side, its rows and columns; ray, see
+    `Ray`; first, number of the objects' first surface.
     """
+    most = jnp.asarray(np.array(hits.distance.shape) - side, jnp.float32)
+    corner = jnp.clip(corner, 0.0, most[None]).astype(jnp.int32)
     rows, columns = jnp.meshgrid(*(jnp.arange(n, dtype=jnp.int32) for n in side), indexing="ij")
     size = objects.offset.shape[1] * objects.offset.shape[2]
 
@@ -168,10 +166,7 @@ def cast_windows(
 
 
 def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
-    """Finds the first geom on the ray from `origin` [3] m along `direction` [3] of any length.
-
-    There is no table unless `solids` has one. Each kind of geom is one loop.
-    """
+    """Finds the first geom on the ray from `origin` [3] m along `direction` [3] of any length."""
 
     def fold(nearest: Any, geom: GeomGroup) -> tuple[Any, None]:
         offset = [origin[axis] - geom.position[axis] for axis in range(3)]
@@ -183,8 +178,8 @@ def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
         entered = (entry.distance, normal, geom.geom)
         return jax.tree.map(functools.partial(jnp.where, closer), entered, nearest), None
 
-    zero = jnp.zeros((), jnp.float32)
-    nearest: Any = (jnp.array(jnp.inf, jnp.float32), (zero, zero, zero), jnp.array(-1, jnp.int32))
+    zero = jnp.float32(0.0)
+    nearest: Any = (jnp.float32(jnp.inf), (zero, zero, zero), jnp.int32(-1))
     for group in solids.groups:
         nearest, _ = jax.lax.scan(fold, nearest, group)
     distance, normal, geom = nearest

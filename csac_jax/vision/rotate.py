@@ -2,7 +2,7 @@
 
 Frame k is rotated by yaw_k = 2 pi k / K about the workspace centre: an action with yaw_k points
 along +column in it. Its canvas is larger than the map by the fraction `margin`, so that rotated
-corners fit; cells keep their size. NumPy tables say which cell goes where: one gather rotates.
+corners fit; cells keep their size.
 """
 
 from typing import Any
@@ -42,10 +42,8 @@ def tables(size: int, extent: float, rotations: int, count: int, margin: float) 
 
 
 def rotate(tables: RotationTables, maps: jax.Array, k: Any = slice(None)) -> jax.Array:
-    """Maps [H, W, ch] in frames `k` [...] int32, 0 <= k < count, all by default: [..., C, C, ch].
-
-    Nearest cell; 0 outside the workspace.
-    """
+    """Rotates maps [H, W, ch] to frames `k` [...] int32, 0 <= k < count, all by default: returns
+    [..., C, C, ch], of each the nearest cell; 0 outside the workspace."""
     index, valid = (jnp.asarray(table)[k] for table in (tables.index, tables.valid))
     rotated = maps.reshape(-1, maps.shape[-1]).at[index].get(mode="promise_in_bounds")
     rotated = jnp.where(valid[..., None], rotated, jnp.zeros((), maps.dtype))
@@ -58,8 +56,7 @@ def to_cell(canvas: int, cell_size: float, yaw: jax.Array, xy: jax.Array) -> jax
 
 
 def floor(position: jax.Array) -> jax.Array:
-    """Rounds positions [...] down to cells or frames, float32; CLOSE below a whole number counts as
-    that number.
+    """Rounds positions [...] down to cells or frames; CLOSE below a whole number counts as it.
 
     XLA may compute a position twice, for the values that are read and for their weights, and round
     it differently. In a cell's centre both must find the same cell.
@@ -68,10 +65,8 @@ def floor(position: jax.Array) -> jax.Array:
 
 
 def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
-    """Interpolates the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells; returns [].
-
-    Cell centres are whole numbers; outside, the nearest edge counts. Differentiable in both.
-    """
+    """Interpolates the map `values` [h, w], h and w >= 2, at `row_col` [2] in cells, whose centres
+    are whole numbers; outside, the nearest edge counts. Differentiable in both."""
     height, width = values.shape
     row = jnp.clip(row_col[0], 0.0, height - 1.0)
     col = jnp.clip(row_col[1], 0.0, width - 1.0)
@@ -80,7 +75,7 @@ def bilinear(values: jax.Array, row_col: jax.Array) -> jax.Array:
     left = jnp.clip(floor(col).astype(jnp.int32), 0, width - 2)
     down, right = row - top.astype(row.dtype), col - left.astype(col.dtype)
 
-    rows, cols = (first + np.arange(2, dtype=np.int32) for first in (top, left))
+    rows, cols = top + np.arange(2, dtype=np.int32), left + np.arange(2, dtype=np.int32)
     corners = values.at[rows[:, None], cols[None]].get(mode="promise_in_bounds")  # [2, 2]
     above, below = (1.0 - right) * corners[:, 0] + right * corners[:, 1]
     return (1.0 - down) * above + down * below

@@ -1,9 +1,6 @@
 """Errors of a real depth camera; those that are off are left out of the program.
 
-For images of another renderer, with a CameraConfig `believed`:
-
-    real = sensor.pose(key_pose, cfg, camera.make(believed))  # draw rgb and depth from here
-    rgb, depth = sensor.image(key_image, cfg, believed, rgb, depth)
+An image of another renderer, drawn from the camera of `pose`, goes through `image`.
 """
 
 from typing import Any
@@ -31,10 +28,7 @@ def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
 
 
 def depth(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Measures exact depths m of any shape; returns them and bool, a pixel has one.
-
-    Normal with standard deviation floor + square d^2; source: SensorConfig.
-    """
+    """Measures exact depths m of any shape; returns them and bool, there is one."""
     key_noise, key_drop = jax.random.split(key)
     measured, valid = exact, jnp.ones(exact.shape, bool)
     floor, square = cfg.depth_noise
@@ -52,7 +46,6 @@ def image(
     """Adds sensor errors to an image of any renderer; errors of pose and lens are in `pose`.
 
     Args: rgb [h, w, 3] uint8; depth [h, w] m along the optical axis, 0 or NaN without one.
-    Returns: the same; depth 0 without one.
     """
     key_depth, key_colour = jax.random.split(key)
     exact, valid = depth.astype(jnp.float32), depth > 0.0
@@ -70,7 +63,7 @@ def depths(
     valid: jax.Array,
     colour: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Measures a depth image [h, w] m by `depth_camera`, then `depth`; see `depth`.
+    """Measures an image by `depth_camera`, then `depth`, whose values it returns.
 
     Args: exact [h, w] m; valid [h, w] bool; colour [h, w, 3], 0 .. 1, as lit.
     """

@@ -20,13 +20,13 @@ from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
 from csac_jax.evaluation.metrics import wilson
-from csac_jax.render import picture
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Plan
 from csac_jax.sim import outcome, physics as simulation
 from csac_jax.vision import camera, sensor
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from experiments.bench._rgbd import RgbdRenderer, intrinsics
 
 COUNTED = (
     *("grasps", "pushes", "refused", "nothing_to_act_on", "out_of_reach", "warnings"),
@@ -134,9 +134,7 @@ def _episode(
     scene = _first_scene(loop, number)
     blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
     counts["blocks"] += blocks
-    studio = picture.RgbdRenderer(
-        model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size
-    )
+    studio = RgbdRenderer(model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size)
     unchanged = 0
     for action in range(task.max_actions):
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), number), action)
@@ -171,11 +169,7 @@ def _first_scene(loop: Loop, number: int) -> SceneState:
 
 
 def _photograph(
-    cfg: Config,
-    errors: SensorConfig,
-    key: jax.Array,
-    studio: picture.RgbdRenderer,
-    scene: SceneState,
+    cfg: Config, errors: SensorConfig, key: jax.Array, studio: RgbdRenderer, scene: SceneState
 ) -> tuple[np.ndarray, np.ndarray]:
     """Renders colour and depth of a scene as the sensor gives them."""
     key_pose, key_image = jax.random.split(key)
@@ -199,7 +193,7 @@ def _decide(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
-            decisions = policy.decide(*image, picture.intrinsics(cfg.camera), _pose(cfg))
+            decisions = policy.decide(*image, intrinsics(cfg.camera), _pose(cfg))
         except ViewError:
             counts["refused"] += 1
             return None

@@ -38,10 +38,10 @@ def main(out_path: str) -> None:
     """Writes colour and depth; exits with 3 where there is no OpenGL."""
     if gl.choose() is None:
         sys.exit(3)
-    from csac_jax.render import picture
     from csac_jax.world import model
+    from experiments.bench._rgbd import RgbdRenderer
 
-    studio = picture.RgbdRenderer(model.build(CFG.scene, CFG.sim), scene(), EYE.size)
+    studio = RgbdRenderer(model.build(CFG.scene, CFG.sim), scene(), EYE.size)
     colour, depth = studio.image(scene(), eye())
     studio.close()
     np.savez(out_path, colour=colour, depth=depth)

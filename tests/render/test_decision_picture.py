@@ -51,11 +51,3 @@ def test_push_is_a_path():
     _, tips, *fingers = drawn.paths(_decision(csac_jax.Action.grasp(0.0, 0.0, 0.0)), 0.012)
     np.testing.assert_allclose(tips[:, 0], [-0.055, 0.055], atol=1e-6)
     assert len(fingers) == 2
-
-
-def test_line_of_text():
-    """Claim: the line has place, yaw in degrees, opening and score."""
-    text = drawn.line(_decision(csac_jax.Action.grasp(0.02, -0.05, 0.5 * np.pi)))
-    assert text == (
-        "grasp at x +0.020, y -0.050, z 0.015 m, yaw 90 degrees, 110 mm open, score +1.00"
-    )

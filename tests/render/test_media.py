@@ -17,19 +17,14 @@ SHADES = range(40, 240, 8)
 
 @pytest.mark.parametrize("suffix", media.PICTURES)
 def test_picture_has_the_format_of_its_suffix(tmp_path: Path, suffix: str):
-    """Claim: every suffix offered gives its format, in folders that need not exist."""
+    """Claim: every suffix offered gives its format, in folders that need not exist; PNG loses
+    nothing."""
     path = tmp_path / "new" / f"a{suffix.upper()}"
-    media.write_picture(path, np.full((30, 46, 3), 90, np.uint8))
+    media.write_picture(path, np.full((31, 46, 3), 90, np.uint8))
     with Image.open(path) as image:
         assert image.format == {"jpg": "JPEG"}.get(suffix[1:], suffix[1:].upper())
-        assert np.abs(np.asarray(image.convert("RGB")).astype(int) - 90).max() <= 2
-
-
-def test_png_is_what_was_drawn(tmp_path: Path):
-    """Claim: PNG loses nothing."""
-    drawn = np.random.default_rng(0).integers(0, 256, (31, 46, 3), np.uint8)
-    media.write_picture(tmp_path / "a.png", drawn)
-    np.testing.assert_array_equal(imageio.imread(tmp_path / "a.png"), drawn)
+        off = np.abs(np.asarray(image.convert("RGB")).astype(int) - 90).max()
+        assert off <= (0 if suffix == ".png" else 2)
 
 
 @pytest.mark.parametrize("suffix", media.VIDEOS)
@@ -61,7 +56,7 @@ def _seconds(path: Path) -> float:
     return 1e-3 * total
 
 
-@pytest.mark.parametrize("name", ["a.txt", "a", "a.bmp"])
+@pytest.mark.parametrize("name", ["a.txt", "a"])
 def test_unknown_format_names_those_that_work(tmp_path: Path, name: str):
     """Claim: another suffix is one line that names the formats, and writes nothing."""
     with pytest.raises(ValueError, match=r"its name must end in one of: \.png, \.jpg, .*\.gif$"):

@@ -5,8 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.figure import Figure
 
@@ -44,16 +42,10 @@ def _cell(x: float, y: float) -> tuple[int, int]:
     return row, col
 
 
-def _map(fig: Figure, title: str) -> Axes:
-    (axes,) = [axes for axes in fig.axes if axes.get_title().startswith(title)]
-    return axes
-
-
-def _drawn(fig: Figure, axes: Axes) -> tuple[np.ndarray, np.ndarray]:
+def _drawn(fig: Figure, title: str) -> tuple[np.ndarray, np.ndarray]:
     """Colours [n, 3] uint8 and places (x, y) [n, 2], m, of the pixels of a map."""
-    canvas = FigureCanvasAgg(fig)
-    canvas.draw()
-    pixels = np.asarray(canvas.buffer_rgba())[::-1, :, :3]  # row 0 is the lowest
+    pixels = heatmaps.pixels(fig)[::-1]  # row 0 is the lowest
+    (axes,) = [axes for axes in fig.axes if axes.get_title().startswith(title)]
     left, bottom, right, top = np.round(axes.bbox.extents).astype(int)
     row, col = np.mgrid[bottom:top, left:right].reshape(2, -1)
     centres = np.stack([col, row], axis=1) + 0.5
@@ -62,7 +54,7 @@ def _drawn(fig: Figure, axes: Axes) -> tuple[np.ndarray, np.ndarray]:
 
 def _places(fig: Figure, title: str, colour: str) -> np.ndarray:
     """Places (x, y) [n, 2], m, of a colour in a map."""
-    colours, places = _drawn(fig, _map(fig, title))
+    colours, places = _drawn(fig, title)
     off = np.abs(colours - 255 * np.array(to_rgb(colour))).max(axis=1)
     return places[off <= 1.0]
 
@@ -70,7 +62,7 @@ def _places(fig: Figure, title: str, colour: str) -> np.ndarray:
 def test_height_map_and_grasp_lie_where_they_are():
     """Claim: x runs to the right and y upwards; a grasp is drawn at its place, along its yaw."""
     fig = panels.figure(CFG, _step(Primitive.GRASP, (-0.1, 0.05, 0.0), learned=False), HEIGHT)
-    colours, places = _drawn(fig, _map(fig, "Height map"))
+    colours, places = _drawn(fig, "Height map")
     inner = np.abs(places).max(axis=1) < 0.215  # without the frame
     dark = inner & (colours.max(axis=1) < 100)
     block = places[dark].mean(axis=0)
@@ -133,28 +125,3 @@ def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tupl
     np.testing.assert_array_equal(told[: size[0]], bare[: size[0]])
     assert (told[size[0] :] < 255).any()
     assert (bare[size[0] :] == 255).all()
-
-
-def test_long_text_stays_in_sight():
-    """Claim: a text too long for one line continues in the next."""
-    short, long = (panels.text_line("word " * count, 600, HEIGHT) < 255 for count in (8, 24))
-    lines = [_runs(image.any(axis=(1, 2))) for image in (short, long)]
-    assert lines == [1, 2]
-    assert not long[:, -5:].any()
-
-
-def _runs(rows: np.ndarray) -> int:
-    """Number of separate runs of True."""
-    return int(np.sum(np.diff(rows.astype(int), prepend=0) == 1))
-
-
-def test_panels_are_drawn_once(monkeypatch: pytest.MonkeyPatch):
-    """Claim: however many pictures an action has, its panels are drawn once."""
-    drawn = []
-    draw = FigureCanvasAgg.draw
-    monkeypatch.setattr(FigureCanvasAgg, "draw", lambda self: (drawn.append(self), draw(self)))
-    complete = panels.frame(CFG, _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned=True), 120)
-    panels.text_line.cache_clear()
-    for shade in range(5):
-        assert complete(np.full((120, 160, 3), shade, np.uint8), "push")[0, 0, 0] == shade
-    assert len(drawn) == 2  # panels and text

@@ -24,20 +24,19 @@ BALL = """
 """
 VIEW = Viewpoint(position=(-1.0, 0.0, 0.8), look_at=(0.0, 0.0, 0.1), size=(96, 64))
 _BOTH = f"""
-import csac_jax, json, sys
+import json, sys
 from csac_jax.render import gl
-backend = gl.choose()
-if backend is None:
+if gl.choose() is None:
     sys.exit(3)
-import mujoco, numpy as np
+import mujoco
 from csac_jax.render import picture
-ways = (picture._opengl_renderer, picture._ray_renderer)
+from csac_jax.render.picture import Viewpoint
 def pictures(xml):
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    view = picture.Viewpoint({VIEW.position}, {VIEW.look_at}, {VIEW.size})
-    return [draw(model, view)(data) for draw in ways]
+    ways = (picture._opengl_renderer, picture._ray_renderer)
+    return [draw(model, {VIEW})(data) for draw in ways]
 skies = pictures("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
 shown = pictures('''{BALL}''')
 print(json.dumps([[image.tolist() for image in shown], [image[0, 0].tolist() for image in skies]]))
@@ -110,6 +109,6 @@ def test_choice_of_opengl(monkeypatch: pytest.MonkeyPatch, given, working, chose
     assert os.environ.get(gl.VARIABLE) == (given or chosen)
 
 
-def test_probe_fails_on_a_backend_that_is_none():
+def test_probe_fails_on_a_backend_that_does_not_draw():
     """Claim: the probe tells a backend that does not draw."""
     assert not gl._draws("nonsense")

@@ -20,18 +20,19 @@ from tests.render.test_episode import CUBE
 
 pytestmark = pytest.mark.mjx
 WINDOW = """
-import mujoco, numpy as np
+import contextlib, mujoco, numpy as np
 from csac_jax.render import viewer
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><geom type='plane' size='1 1 1'/>"
     "<body><freejoint/><geom size='.05'/></body></worldbody></mujoco>")
 poses = [np.array([0, 0, z, 1, 0, 0, 0]) for z in (0.1, 0.2, 0.3)]
-seen, show = [], viewer._Window.show
-def counted(self, data, text):
-    seen.append(float(data.xpos[1, 2]))
-    return show(self, data, text)
-viewer._Window.show = counted
-viewer.play(model, [viewer.Pictured("up", poses)], print, again=False)
+seen, window = [], viewer._window
+@contextlib.contextmanager
+def counted(model):
+    with window(model) as show:
+        yield lambda data, text: (seen.append(float(data.xpos[1, 2])), show(data, text))[1]
+viewer._window = counted
+viewer.play(model, [("up", poses)], print, again=False)
 print(seen)
 """
 

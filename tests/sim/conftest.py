@@ -89,23 +89,21 @@ def thrown_objects(cfg: Config) -> tuple[SceneState, JointTrajectory]:
     rng, known = np.random.default_rng(0), object_slots.table(cfg.scene)
     order = np.argsort(known.present.sum(axis=1))
     scenes = []
+    parked = scene_state.parked(cfg.scene.slots)
     for row, pair in enumerate(zip(order[:4], order[-4:], strict=True)):
-        scene = object_slots.hold(
-            scene_state.parked(cfg.scene.slots), np.arange(2), np.array(pair), known
-        )
+        scene = object_slots.hold(parked, np.arange(2), np.array(pair), known)
         turns = rng.normal(size=(2, 4))
         above, aside = [[0.0, 0.0, 0.3], [0.005, 0.0, 0.4]], [[-0.15, 0.0, 0.08], [0.15, 0.0, 0.08]]
         falling, thrown = [[0.0] * 6, [0.0, 0.0, -1.5, 0.0, 0.0, 0.0]], rng.normal(0.0, 3.0, (2, 6))
         thrown[:, :3] = [0.0, 0.0, -0.5]
-        scenes.append(
-            scene.replace(
-                position=np.float32(above if row < 2 else aside),
-                quaternion=np.float32(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
-                velocity=np.float32(falling if row < 2 else thrown),
-                density=np.float32([500.0, 800.0]),
-                in_play=np.ones(2, bool),
-            )
+        scene = scene.replace(
+            position=np.float32(above if row < 2 else aside),
+            quaternion=np.float32(turns / np.linalg.norm(turns, axis=1, keepdims=True)),
+            velocity=np.float32(falling if row < 2 else thrown),
+            density=np.float32([500.0, 800.0]),
+            in_play=np.ones(2, bool),
         )
+        scenes.append(scene)
     start = np.float32([0.0, 0.0, 0.4, 0.0, 0.05, 0.05])
     still = JointTrajectory(start, np.tile(start[:5], (cfg.sim.substeps, 1)), np.ones((), bool))
     return stack(scenes), stack([still] * len(scenes))
@@ -200,11 +198,6 @@ def execute_settled(
         batches.insert(0, stack(scripted))
     scenes, actions = jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
     return execute(config, scenes, actions)
-
-
-@pytest.fixture(scope="session")
-def config() -> Config:
-    return CONFIG
 
 
 @pytest.fixture(scope="session")

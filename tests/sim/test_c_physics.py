@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from csac_jax.robot import primitives
-from csac_jax.robot.primitives import JointTrajectory
 from csac_jax.sim import c_physics
-from csac_jax.sim.c_physics import CPhysics, CSimulator, Trajectory
+from csac_jax.sim.c_physics import CPhysics, Trajectory
 from csac_jax.world import model, scene_state
 from tests.sim import conftest, slow_loop
-from tests.world import placed
 
 pytestmark = pytest.mark.mjx
 
@@ -38,10 +36,16 @@ def _fields(world: model.World, scene: scene_state.SceneState) -> model.BlockFie
     return jax.device_get(model.scene_fields(world, scene))
 
 
-def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple):
-    """Claim: a trajectory has every substep; its last is the end of a run, bit for bit."""
+def test_trajectory_goes_the_way_of_the_run(world, c_world: model.World, pushed: tuple):
+    """Claim: a trajectory has every substep; its last is the end of a run, bit for bit. A world of
+    MJX, without touch sensors, moves in C as one that was built for C, but is refused as physics.
+    """
     scene, fields, joints = pushed
+    by_mjx = c_physics.trajectory(world, fields, scene, joints)
+    with pytest.raises(ValueError, match=r"no touch sensors; build it with sim\.physics c"):
+        CPhysics(world, conftest.CONFIG.sim)
     recorded = c_physics.trajectory(c_world, fields, scene, joints)
+    np.testing.assert_array_equal(recorded.qpos, by_mjx.qpos)
     after, trace = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, joints)
     assert recorded.qpos.shape == (len(joints.control), c_world.model.nq)
     last = recorded.qpos[-1][c_world.block_qpos[0, :3]].astype(np.float32)
@@ -50,24 +54,6 @@ def test_trajectory_goes_the_way_of_the_run(c_world: model.World, pushed: tuple)
     assert trace.touched
     assert moved[0] < 0.061 < moved[-1] - 0.04
     assert (np.diff(moved) > -1e-4).all()  # never back
-
-
-def test_trajectory_that_the_robot_cannot_follow_is_empty(c_world: model.World, pushed: tuple):
-    """Claim: where the robot cannot follow, nothing moves: the trajectory has no substep."""
-    scene, fields, joints = pushed
-    unreachable: JointTrajectory = dataclasses.replace(joints, reachable=np.array(False))
-    recorded = c_physics.trajectory(c_world, fields, scene, unreachable)
-    assert recorded.qpos.shape == (0, c_world.model.nq)
-    assert recorded.qvel.shape == (0, c_world.model.nv)
-
-
-def test_trajectory_needs_no_touch_sensors(world: model.World, c_world: model.World, pushed: tuple):
-    """Claim: a world that was built for MJX moves in C as one that was built for C."""
-    scene, *rest = pushed
-    ours, theirs = (
-        c_physics.trajectory(built, rest[0], scene, rest[1]) for built in (world, c_world)
-    )
-    np.testing.assert_array_equal(ours.qpos, theirs.qpos)
 
 
 def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pushed: tuple):
@@ -121,17 +107,6 @@ def test_scenes_of_a_batch_do_not_meet(c_world: model.World, pushed: tuple):
     np.testing.assert_array_equal(after.position[3, 0], broken.position[0])
 
 
-def test_set_points_with_nan_move_nothing(
-    c_world: model.World, pushed: tuple, capfd: pytest.CaptureFixture
-):
-    """Claim: set-points of NaN, as networks of NaN plan them, move nothing, without a word."""
-    scene, _, joints = pushed
-    lost = dataclasses.replace(joints, control=np.full_like(joints.control, np.nan))
-    after, _ = jax.jit(CPhysics(c_world, conftest.CONFIG.sim).run)(scene, lost)
-    np.testing.assert_array_equal(after.position[0], scene.position[0])
-    assert capfd.readouterr() == ("", "")
-
-
 @pytest.mark.parametrize("metres", [0.02, 0.1, 0.3])
 def test_limit_of_speed_is_held_after_every_substep(
     c_world: model.World, pushed: tuple, monkeypatch: pytest.MonkeyPatch, metres: float
@@ -161,64 +136,40 @@ def test_simulators_are_used_again(
 
     def one(row: tuple) -> Trajectory:
         with physics._simulator() as simulator:
-            return c_physics._rollout(c_world, simulator, *row)
-
-    def rollouts(chosen: list[tuple]) -> list[Trajectory]:
-        return list(physics._threads.map(one, chosen))
+            return simulator.rollout(*row)
 
     def check(chosen: list[int]) -> None:
-        for i, recorded in zip(chosen, rollouts([rows[i] for i in chosen]), strict=True):
-            _assert_equal(recorded, wanted[i])
+        recorded = physics._threads.map(one, [rows[i] for i in chosen])
+        for i, trajectory in zip(chosen, recorded, strict=True):
+            _assert_equal(trajectory, wanted[i])
 
     for chosen in ([0], [2, 1, 0], [1], [0, 2]):
         check(chosen)
-    rollouts([(conftest.place(prism=(-0.1, 0.1, 0.0)), rows[0][1], joints)] * 3)
+    list(
+        physics._threads.map(one, [(conftest.place(prism=(-0.1, 0.1, 0)), rows[0][1], joints)] * 3)
+    )
     check([0])
     with concurrent.futures.ThreadPoolExecutor() as threads:
         list(threads.map(check, [[0, 1, 2], [2, 0], [1]] * 4))
 
 
-def test_scenes_leave_nothing_behind_in_a_simulator(c_world: model.World, pushed: tuple):
-    """Claim: after any scene a simulator's model is, byte for byte, that of a fresh simulator."""
-    _, _, joints = pushed
-    scenes = [
-        conftest.place(cube=(0.06, 0.0, 0.0)),
-        conftest.place(prism=(-0.1, 0.1, 0.4)),
-        conftest.place(cube=(0.06, 0.0, 0.0), other=(-0.1, 0.0, 0.0), prism=(0.0, 0.1, 0.0)),
-    ]
-    scenes.append(dataclasses.replace(scenes[2], half_size=1.1 * np.asarray(scenes[2].half_size)))
-    rows = [(one, _fields(c_world, one), joints) for one in scenes]
-
-    def after(simulator: CSimulator, row: tuple) -> bytes:
-        c_physics._rollout(c_world, simulator, *row)
-        return placed.model_bytes(simulator.model)
-
-    wanted = [after(CSimulator(c_world), row) for row in rows]
-    assert len(set(wanted)) == len(rows)
-    used = CSimulator(c_world)
-    for i in (0, 1, 2, 3, 2, 1, 3, 0, 2, 0):
-        assert after(used, rows[i]) == wanted[i]
-
-
-def test_world_of_mjx_is_refused(world: model.World):
-    """Claim: a world without touch sensors is one line that says how to build another."""
-    with pytest.raises(ValueError, match=r"no touch sensors; build it with sim\.physics c"):
-        CPhysics(world, conftest.CONFIG.sim)
-
-
-def test_nothing_to_move(c_world: model.World, pushed: tuple):
-    """Claim: an empty table and an unreachable plan leave the scene as it is, the trace blank."""
+def test_nothing_to_move(c_world: model.World, pushed: tuple, capfd: pytest.CaptureFixture):
+    """Claim: an empty table, an unreachable plan and set-points of NaN, as networks of NaN plan
+    them, leave the scene as it is and the trace blank, without a word."""
     scene, fields, joints = pushed
     cleared = dataclasses.replace(scene, in_play=np.zeros(len(c_world.slots), bool))
     unreachable = dataclasses.replace(joints, reachable=np.array(False))
+    lost = dataclasses.replace(joints, control=np.full_like(joints.control, np.nan))
+    assert c_physics.trajectory(c_world, fields, scene, unreachable).qpos.shape[0] == 0
     physics = CPhysics(c_world, conftest.CONFIG.sim)
-    for its, way in ((cleared, joints), (scene, unreachable)):
+    for its, way in ((cleared, joints), (scene, unreachable), (scene, lost)):
         row = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (its, fields, way))
         after, seen = physics._run_batch(*row)
         jax.tree.map(np.testing.assert_array_equal, after, row[0])
         assert not any(leaf.any() for leaf in jax.tree.leaves(seen))
         _, trace = jax.jit(physics.run)(its, way)
         assert not any(np.any(leaf) for leaf in jax.tree.leaves(trace))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_key_tells_worlds_apart(c_world: model.World):

@@ -13,21 +13,18 @@ from csac_jax.env import Env
 from csac_jax.objects import library, shapes
 from csac_jax.robot import primitives
 from csac_jax.scenes import pool
-from csac_jax.sim import backend, c_physics, physics
+from csac_jax.sim import c_physics, physics
 from csac_jax.sim.c_physics import CPhysics
 from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
-SCENE = {
-    "slots": ("object",) * 3,
-    "min_blocks": 3,
-    "objects": "procedural:0:42",
-    "settle_time": 1.0,
-}
+SCENE = {"slots": ("object",) * 3, "min_blocks": 3, "objects": "procedural:0:42"}
 CONFIG = Config().change(
-    scene=SCENE | {"drop_extent": (0.3, 0.3)}, sim={"physics": "c"}, task={"kind": "clear"}
+    scene=SCENE | {"drop_extent": (0.3, 0.3), "settle_time": 1.0},
+    sim={"physics": "c"},
+    task={"kind": "clear"},
 )
 
 
@@ -70,22 +67,12 @@ def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
         np.testing.assert_array_equal(np.asarray(getattr(after.scene, name))[order], theirs)
 
 
-def test_objects_choose_c():
-    """Claim: auto stands for C with objects, and MJX is refused in one line with the remedy."""
-    unresolved = CONFIG.change(sim={"physics": "auto"})
-    assert backend.resolve(unresolved).sim.physics == "c"
-    with pytest.raises(ValueError, match=r"sim\.physics: objects .* need c, warp or auto"):
-        CONFIG.change(sim={"physics": "mjx"})
-
-
 def test_objects_need_a_library():
     """Claim: objects without a library, and packed scenes of both kinds, are refused by setting."""
     with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
         dataclasses.replace(CONFIG.scene, objects="")
     with pytest.raises(ValueError, match=r"scene\.packed_fraction: must be 0"):
-        dataclasses.replace(
-            CONFIG.scene, slots=("box", "object"), min_blocks=2, packed_fraction=0.5
-        )
+        CONFIG.change(scene={"slots": ("box", "object"), "min_blocks": 2, "packed_fraction": 0.5})
 
 
 def _grasp(env: Env, scene: SceneState) -> tuple:
@@ -112,12 +99,11 @@ def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
 @pytest.mark.slow
 def test_a_scene_moves_the_same_after_any_other(env: Env):
     """Claim: what slept in a simulator's last scene does not show in the next one, to the bit."""
-    world, used = env.physics.world, c_physics.CSimulator(env.physics.world)
+    used = c_physics.CSimulator(env.physics.world)
     for i in range(6):
         row = _grasp(env, jax.tree.map(lambda leaf, i=i: leaf[i], env.scenes))
-        again = c_physics._rollout(world, used, *row)
-        fresh = c_physics._rollout(world, c_physics.CSimulator(world), *row)
-        np.testing.assert_array_equal(again.qpos, fresh.qpos)
+        fresh = c_physics.CSimulator(env.physics.world)
+        np.testing.assert_array_equal(used.rollout(*row).qpos, fresh.rollout(*row).qpos)
 
 
 def _slip(cfg: Config) -> float:

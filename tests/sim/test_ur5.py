@@ -30,9 +30,8 @@ _joints = jax.jit(functools.partial(primitives.joint_trajectory, SIM))
 @functools.cache
 def _model(with_block: bool = False) -> mujoco.MjModel:
     """Table, arm, hand and at will a cube, with the solver as in training."""
-    spec, part = (
-        mujoco.MjSpec.from_file(str(assets() / f"{name}.xml")) for name in ("table", "blocks")
-    )
+    files = (str(assets() / f"{name}.xml") for name in ("table", "blocks"))
+    spec, part = map(mujoco.MjSpec.from_file, files)
     mjcf.add(spec, SIM, RG2)
     spec.attach(part, prefix="blocks/", frame=spec.worldbody.add_frame())
     if with_block:

@@ -1,55 +1,40 @@
-"""One scene as a MuJoCo model, the reference, and as half-spaces for the raycaster."""
+"""One scene of blocks in C MuJoCo, the reference, and as half-spaces for the raycaster."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
-from csac_jax.vision import raycast
+from csac_jax.config import SceneConfig, SimConfig, SlotKind
+from csac_jax.vision import observe, raycast
+from csac_jax.world import blocks, model, scene_state
+from tests.vision import mujoco_rays
 
-_OCTAGON = [(np.cos(a), np.sin(a)) for a in np.pi / 4 * (np.arange(8) + 0.5)]
-_MESHES = {
-    "prism": [
-        (x, 0.025 * side, z)
-        for x, z in ((-0.0467, -0.0243), (0.0467, -0.0243), (0.0, 0.0243))
-        for side in (-1, 1)
-    ],
-    "octagon": [(0.0242 * x, 0.0242 * y, z) for x, y in _OCTAGON for z in (-0.025, 0.025)],
-}
-_GEOMS = (  # attributes, position, rotation vector in degrees
-    ('type="box" size="0.05 0.025 0.025"', "0.02 0.01 0.025", "0 0 30"),
-    ('type="box" size="0.025 0.025 0.025"', "0.03 0.015 0.085", "20 35 10"),
-    ('type="mesh" mesh="prism"', "-0.08 0.05 0.0243", "0 0 -50"),
-    ('type="mesh" mesh="prism"', "-0.06 -0.09 0.05", "70 20 15"),
-    ('type="mesh" mesh="octagon"', "0.11 -0.07 0.025", "0 0 12"),
-    ('type="mesh" mesh="octagon"', "-0.14 -0.02 0.04", "80 10 40"),
+_BLOCKS = (  # shape, position, Euler angles in degrees
+    ("cuboid", (0.02, 0.01, 0.025), (0, 0, 30)),
+    ("cube", (0.03, 0.015, 0.085), (20, 35, 10)),
+    ("prism", (-0.08, 0.05, 0.0243), (0, 0, -50)),
+    ("prism", (-0.06, -0.09, 0.05), (70, 20, 15)),
+    ("cylinder", (0.11, -0.07, 0.025), (0, 0, 12)),
+    ("cylinder", (-0.14, -0.02, 0.04), (80, 10, 40)),
 )
-_FACES = 10
 
 
 class Reference(NamedTuple):
-    """A scene for C MuJoCo (geom 0 is the table) and for the raycaster (geom i is C's i + 1)."""
+    """A scene for C MuJoCo and for the raycaster."""
 
-    model: mujoco.MjModel
+    world: model.World
     data: mujoco.MjData
     polytopes: raycast.Polytopes
 
-    def ray(self, origin: np.ndarray, direction: np.ndarray) -> tuple[float, int, np.ndarray]:
-        """Distance, geom (-2 for a miss) and normal of one ray, from C MuJoCo."""
-        geom, normal = np.zeros((1, 1), np.int32), np.zeros((3, 1))
-        start, along = origin[:, None], direction[:, None]
-        distance = mujoco.mj_ray(self.model, self.data, start, along, None, 1, -1, geom, normal)
-        return distance, int(geom[0, 0]) - 1, normal[:, 0]
-
-    def rays(
-        self, origins: np.ndarray, directions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distances [R], geoms [R] and normals [R, 3] of many rays."""
-        distance, geom, normal = zip(*map(self.ray, origins, directions), strict=True)
-        return np.array(distance), np.array(geom), np.array(normal)
+    def rays(self, origins: np.ndarray, directions: np.ndarray) -> mujoco_rays.Rays:
+        """Hits of rays from C MuJoCo; geoms are slots, -1 the table and -2 a miss."""
+        hits = mujoco_rays.cast(self.data.model, self.data, origins, directions)
+        return hits._replace(geom=np.where(hits.geom < 0, -2, self.world.slot_of_geom[hits.geom]))
 
     def near_edge(self, origins: np.ndarray, directions: np.ndarray, shift: float) -> np.ndarray:
         """[R] bool, a ray `shift` m beside this one meets another face or nothing."""
@@ -65,42 +50,23 @@ class Reference(NamedTuple):
         return edge
 
 
-def _half_spaces(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
-    """Normals [F, 3] and offsets [F] of one geom, own frame, from its corners' convex hull."""
-    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-        corners = model.geom_size[geom] * np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
-    else:
-        mesh = model.geom_dataid[geom]
-        start = model.mesh_vertadr[mesh]
-        corners = model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
-    equations = ConvexHull(corners).equations
-    _, kept = np.unique(equations.round(4), axis=0, return_index=True)  # the hull is triangulated
-    return equations[kept, :3], -equations[kept, 3]
-
-
 @pytest.fixture(scope="session")
 def reference() -> Reference:
     """Two boxes, two triangular and two octagonal prisms in several poses on the table."""
-    meshes = "".join(
-        f'<mesh name="{name}" vertex="{" ".join(str(v) for p in points for v in p)}"/>'
-        for name, points in _MESHES.items()
+    names, position, angles = zip(*_BLOCKS, strict=True)
+    slots: tuple[SlotKind, ...] = tuple(blocks.SHAPES[name].kind for name in names)
+    quaternion = Rotation.from_euler("XYZ", angles, degrees=True).as_quat(scalar_first=True)
+    scene = scene_state.parked(slots).replace(
+        position=np.float32(position),
+        quaternion=np.float32(quaternion),
+        half_size=np.float32([blocks.SHAPES[name].half_size for name in names]),
+        in_play=np.ones(len(slots), bool),
+        colour=np.arange(len(slots), dtype=np.int32),
     )
-    geoms = "".join(f'<geom {kind} pos="{pos}" euler="{euler}"/>' for kind, pos, euler in _GEOMS)
-    model = mujoco.MjModel.from_xml_string(
-        f"<mujoco><asset>{meshes}</asset><worldbody>"
-        f'<geom type="plane" size="0 0 1"/>{geoms}</worldbody></mujoco>'
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    normal, offset = np.zeros((len(_GEOMS), _FACES, 3)), np.ones((len(_GEOMS), _FACES))
-    for geom in range(len(_GEOMS)):
-        faces, offsets = _half_spaces(model, geom + 1)
-        normal[geom, : len(faces)], offset[geom, : len(faces)] = faces, offsets
-    colour = np.random.default_rng(0).uniform(size=(len(_GEOMS), 3))
-    pose = data.geom_xpos[1:], data.geom_xmat[1:].reshape(-1, 3, 3)
-    leaves = (jnp.asarray(leaf, jnp.float32) for leaf in (normal, offset, *pose, colour))
-    polytopes = raycast.Polytopes(*leaves)
-    return Reference(model, data, polytopes)
+    with mujoco_rays.nominal_meshes():
+        world = model.build(SceneConfig(slots=slots, min_blocks=1), SimConfig(physics="c"))
+    polytopes = observe.polytopes(slots, jax.tree.map(jnp.asarray, scene))
+    return Reference(world, mujoco_rays.placed(world, scene).data, polytopes)
 
 
 def cubes(*places: tuple[float, float, float]) -> raycast.Polytopes:

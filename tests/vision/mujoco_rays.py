@@ -1,5 +1,7 @@
 """Models with every kind of geom, and many rays through them by C MuJoCo."""
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -29,14 +31,32 @@ class Rays(NamedTuple):
     normal: np.ndarray  # [R, 3]
 
 
+@contextlib.contextmanager
+def nominal_meshes() -> Iterator[None]:
+    """Worlds whose meshes C's rays see: its search trees follow neither rescaling nor turns."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(models, "LARGEST", 1.0)
+        patch.setattr(models, "_align_inertia", lambda model: None)
+        yield
+
+
+def placed(world: models.World, scene: scene_state.SceneState) -> Placed:
+    """A scene of a world that was built by `nominal_meshes`, the hand high above."""
+    with nominal_meshes():
+        fields = jax.device_get(models.scene_fields(world, scene))
+    model = models.with_blocks(world, fields)
+    data = mujoco.MjData(model)
+    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
+    data.qpos[world.robot_qpos[2]] = 3.0
+    mujoco.mj_kinematics(model, data)
+    return Placed(model, data)
+
+
 def blocks_and_arm(rng: np.random.Generator) -> Placed:
     """The eight blocks in random poses under and about the UR5 with its hand, on the table."""
     scene = scene_state.parked(SLOTS)
     half_size = np.array([blocks.SHAPES[name].half_size for name in SHAPES], np.float32)
-    # C's search trees follow neither rescaled meshes nor turned inertias
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(models, "LARGEST", 1.0)
-        patch.setattr(models, "_align_inertia", lambda model: None)
+    with nominal_meshes():
         world = models.build(SceneConfig(slots=SLOTS, min_blocks=1), SimConfig(robot="ur5"))
         fields = jax.device_get(models.scene_fields(world, scene.replace(half_size=half_size)))
     model = models.with_blocks(world, fields)
@@ -84,13 +104,15 @@ def read(model: mujoco.MjModel, data: mujoco.MjData) -> solids.Solids:
 
 
 def cast(model: mujoco.MjModel, data: mujoco.MjData, origin: Any, direction: Any) -> Rays:
-    """R rays along `direction` [R, 3] from `origin` [3] by C; `mj_multiRay` loses some at edges."""
-    num = len(direction)
+    """R rays along `direction` [R, 3] from `origin` [3] or [R, 3] by C, one by one: `mj_multiRay`
+    loses some at edges."""
+    num, found, surface = len(direction), np.zeros((1, 1), np.int32), np.zeros((3, 1))
+    start = np.array(np.broadcast_to(origin, (num, 3)), np.float64)[:, :, None]
+    along = np.array(direction, np.float64)[:, :, None]
     distance, geom, normal = np.zeros(num), np.zeros(num, np.int32), np.zeros((num, 3))
-    start, along = origin.astype(np.float64)[:, None], direction.astype(np.float64)[:, :, None]
-    found, surface = np.zeros((1, 1), np.int32), np.zeros((3, 1))
     for ray in range(num):
-        distance[ray] = mujoco.mj_ray(model, data, start, along[ray], None, 1, -1, found, surface)
+        at = start[ray], along[ray]
+        distance[ray] = mujoco.mj_ray(model, data, *at, None, 1, -1, found, surface)
         geom[ray], normal[ray] = found[0, 0], surface[:, 0]
     return Rays(distance, geom, normal)
 

@@ -1,11 +1,6 @@
-"""The pinhole camera against MuJoCo's renderer, and its geometry."""
+"""The pinhole camera's geometry and colours."""
 
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,46 +10,7 @@ import pytest
 
 from csac_jax.config import CameraConfig
 from csac_jax.vision import camera
-from tests.vision import mujoco_rays, render_depth
-
-_render = jax.jit(camera.render)
-
-
-def _opengl_depth(folder: Path, model: mujoco.MjModel, data: mujoco.MjData, eye: Any) -> np.ndarray:
-    """Depth [H, W] m by MuJoCo's renderer; skips where there is no OpenGL without a display."""
-    mujoco.mj_saveModel(model, str(folder / "model.mjb"))
-    pose = np.stack([eye.position, eye.rotation[:, 2], -eye.rotation[:, 1]])
-    size = (eye.width, eye.height)
-    np.savez(folder / "pose.npz", qpos=data.qpos, pose=pose, focal=eye.focal[1], size=size)
-    files = [str(folder / name) for name in ("model.mjb", "pose.npz", "depth.npy")]
-    for backend in ("egl", "osmesa"):
-        environment = os.environ | {"MUJOCO_GL": backend}
-        command = [sys.executable, render_depth.__file__, *files]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        if done.returncode == 0:
-            return np.load(files[2])
-    pytest.skip("no OpenGL by EGL or OSMesa: " + done.stderr.strip().splitlines()[-1])
-
-
-@pytest.mark.parametrize(
-    "make",
-    [mujoco_rays.every_type, pytest.param(mujoco_rays.blocks_and_arm, marks=pytest.mark.slow)],
-)
-def test_depth_agrees_with_opengl(tmp_path, make):
-    """Claim: depths are those of MuJoCo's renderer to 2 mm, two pixels off edges or more."""
-    model, data = make(np.random.default_rng(5))
-    eye = camera.make(CameraConfig(position=(-0.7, -0.3, 0.6), look_at=(0.1, 0.0, 0.1)).scaled(0.5))
-    expected = _opengl_depth(tmp_path, model, data, eye)
-    picture = jax.device_get(_render(eye, mujoco_rays.read(model, data)))
-    depth = np.where(picture.valid, picture.depth, expected.max())  # the renderer's far plane
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(1.0 / depth, 2, mode="edge"), (5, 5))
-    bend = np.abs(windows + windows[..., ::-1, ::-1] - 2.0 / depth[..., None, None]).max((2, 3))
-    clear = bend < 0.01  # the inverse depth of a plane is linear in the image
-    assert clear.mean() > 0.9
-    assert len(np.unique(picture.geom[clear])) >= 6
-    off = np.abs(depth - expected)[clear & picture.valid]
-    assert off.max() < 2e-3
-    assert np.median(off) < 1e-5
+from tests.vision import mujoco_rays
 
 
 def test_the_default_is_the_papers_camera():
@@ -94,15 +50,15 @@ def test_colours_are_flat_shaded():
     )
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    picture = _render(camera.make(CameraConfig().scaled(0.1)), mujoco_rays.read(model, data))
-    colour, valid = np.asarray(picture.colour), np.asarray(picture.valid)
-    assert colour.shape == (48, 64, 3)
-    np.testing.assert_allclose(colour[~valid], np.broadcast_to(camera.SKY, colour[~valid].shape))
-    np.testing.assert_array_equal(np.asarray(picture.depth)[~valid], 0.0)
-    levels = np.unique((colour[valid] / [0.2, 0.4, 0.8]).round(3))
+    eye = camera.make(CameraConfig().scaled(0.1))
+    picture = jax.device_get(jax.jit(camera.render)(eye, mujoco_rays.read(model, data)))
+    sky = ~picture.valid
+    assert picture.colour.shape == (48, 64, 3)
+    np.testing.assert_allclose(picture.colour[sky], np.tile(camera.SKY, (sky.sum(), 1)))
+    assert not picture.depth[sky].any()
+    levels = np.unique((picture.colour[~sky] / [0.2, 0.4, 0.8]).round(3))
     # the side towards the camera faces away from the light, the top does not
-    expected = [0.4, 0.4 + 0.6 * 0.8]
-    np.testing.assert_allclose(levels, expected, atol=2e-3)
+    np.testing.assert_allclose(levels, [0.4, 0.4 + 0.6 * 0.8], atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -110,9 +66,8 @@ def test_colours_are_flat_shaded():
     [
         (1.0, {"size": (320, 240)}, "camera.centre: .* give the camera.size"),
         (1.0, {"size": (640, 480), "centre": (159.5, 119.5)}, "camera.centre"),
-        (1.0, {"focal": (80.0, 80.0)}, "camera.focal"),
         (1.0, {"focal": (618.0, 300.0)}, "camera.focal"),
-        (1.0, {"size": (4, 4), "centre": (1.5, 1.5)}, "camera.size: must lie in 8"),
+        (1.0, {"size": (4, 4), "centre": (1.5, 1.5)}, "camera.size: must be at least 8"),
         (1.0, {"position": (0.0, 0.0, 0.7)}, "camera.position"),
         (0.3331, {}, "camera: .*whole"),
         (0.0, {}, "camera.size"),
@@ -120,6 +75,5 @@ def test_colours_are_flat_shaded():
 )
 def test_wrong_intrinsics_are_refused(share, change, message):
     """Claim: intrinsics of another image size, nonsense, and parts of pixels are refused."""
-    with pytest.raises(ValueError, match=message) as error:
+    with pytest.raises(ValueError, match=message):
         dataclasses.replace(CameraConfig(), **change).scaled(share)
-    assert "\n" not in str(error.value)

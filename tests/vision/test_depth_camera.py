@@ -24,8 +24,6 @@ class Picture(NamedTuple):
     """Exact rays' results; [h, w, ...] NumPy."""
 
     depth: np.ndarray  # m, 0 where nothing is hit
-    points: np.ndarray  # m
-    normal: np.ndarray
     lit: np.ndarray  # colours
     shadow: np.ndarray  # bool, something stands between the point and the second viewpoint
     near_shadow: np.ndarray  # bool, within 1.5 pixels of the border of a shadow
@@ -40,19 +38,18 @@ def picture() -> Picture:
     def cast() -> Any:
         hits = camera.cast_rays(eye, raycast.cast_polytopes, SHAPES)
         points = camera.points(eye, jnp.where(hits.valid, hits.distance, 1.0))
-        normal = raycast.surface_normals(SHAPES)[hits.surface]
         lit = observe.surface_tables(SHAPES, jnp.ones(2, bool)).colour[hits.surface]
         second = eye.position + WIDE.baseline * eye.rotation[:, 0]
         to_points = (points - second[None, None]).reshape(-1, 3)
         back = jax.vmap(raycast.cast_polytopes, (None, None, 0))(SHAPES, second, to_points)
-        return hits, points, normal, lit, back.distance.reshape(hits.distance.shape)
+        return hits, lit, back.distance.reshape(hits.distance.shape)
 
-    hits, points, normal, lit, reached = jax.device_get(cast())
+    hits, lit, reached = jax.device_get(cast())
     shadow = hits.valid & (reached < 0.99)
     spread = np.lib.stride_tricks.sliding_window_view(np.pad(shadow, 2, mode="edge"), (5, 5))
     border = spread.any((2, 3)) & ~spread.all((2, 3))
     depth = np.where(hits.valid, hits.distance, 0.0).astype(np.float32)
-    return Picture(depth, points, normal, lit, shadow, border)
+    return Picture(depth, lit, shadow, border)
 
 
 def _plane(distance: float, lightness: float = 0.5, kind: Any = "d415") -> Any:
@@ -66,20 +63,24 @@ def _plane(distance: float, lightness: float = 0.5, kind: Any = "d415") -> Any:
 
 
 @pytest.mark.parametrize(
-    ("kind", "distance", "error"),
+    ("kind", "distance", "error", "alike"),
     [
-        ("d415", 2.0, 2.0**2 * 0.08 / (1004.6 * 0.055)),  # z^2 subpixel / (f b)
-        ("d435", 2.0, 2.0**2 * 0.08 / (424.0 * 0.050)),
-        ("azure_kinect", 0.5 * 3.86, 0.25 * 0.017),
+        ("d415", 2.0, 2.0**2 * 0.08 / (1004.6 * 0.055), None),  # z^2 subpixel / (f b)
+        ("d435", 2.0, 2.0**2 * 0.08 / (424.0 * 0.050), 4 / 5),
+        ("azure_kinect", 0.5 * 3.86, 0.25 * 0.017, 0.0),
     ],
 )
-def test_errors_are_those_of_the_data_sheets(kind: str, distance: float, error: float):
-    """Claim: depths of a wall err by the makers' figure, on top of which are the steps' errors."""
+def test_errors_are_those_of_the_data_sheets(kind: str, distance: float, error: float, alike: Any):
+    """Claim: depths of a wall err by the makers' figure, on top of which are the steps' errors.
+    Errors are alike within a stereo camera's window, not in time of flight."""
     depth, valid = _plane(distance, kind=kind)
     off = depth[valid] - distance
     step = depth_camera.CAMERAS[kind].step * distance**2
     assert np.std(off) == pytest.approx(np.hypot(error, step / 12**0.5), rel=0.1)
     assert abs(np.mean(off)) < 0.1 * error
+    if alike is not None:
+        correlation = np.corrcoef(depth[:, 1:].ravel(), depth[:, :-1].ravel())[0, 1]
+        assert correlation == pytest.approx(alike, abs=0.05)
 
 
 def test_disparities_have_steps():
@@ -106,14 +107,6 @@ def test_range_and_darkness(distance: float, lightness: float, kind: str, share:
     assert abs(valid.mean() - share) < 0.06
 
 
-def test_neighbours_err_alike():
-    """Claim: errors are alike within a stereo camera's window, not in time of flight."""
-    for kind, wanted in (("d435", 4 / 5), ("azure_kinect", 0.0)):
-        depth, _ = _plane(2.0, kind=kind)
-        found = np.corrcoef(depth[:, 1:].ravel(), depth[:, :-1].ravel())[0, 1]
-        assert found == pytest.approx(wanted, abs=0.05)
-
-
 def test_shadow_is_what_the_second_viewpoint_does_not_see(picture: Picture):
     """Claim: shadows are where rays to the second viewpoint are blocked."""
     inverse = np.divide(1.0, picture.depth, where=picture.depth > 0, out=0 * picture.depth)
@@ -122,19 +115,6 @@ def test_shadow_is_what_the_second_viewpoint_does_not_see(picture: Picture):
     wrong = (hidden != picture.shadow) & (picture.depth > 0)
     assert not np.any(wrong & ~picture.near_shadow)
     assert wrong.sum() < 0.3 * picture.shadow.sum()
-
-
-def test_angle_is_that_of_the_normals(picture: Picture):
-    """Claim: away from edges the angle between ray and surface is that of the exact normals."""
-    inverse = jnp.asarray(1.0 / np.where(picture.depth > 0, picture.depth, np.inf))
-    around = depth_camera._shifted(inverse, 1)
-    flat = np.asarray(depth_camera._bend(inverse, around)) < 1e-4
-    flat[:, [0, -1]] = flat[[0, -1]] = False  # the image ends there
-    found = np.asarray(depth_camera._cosine(EYE, inverse, around, 1))
-    ray = picture.points - np.asarray(camera.make(EYE).position)
-    wanted = -np.sum(ray * picture.normal, axis=-1) / np.linalg.norm(ray, axis=-1)
-    assert len(np.unique(picture.normal[flat].round(3), axis=0)) >= 3
-    np.testing.assert_allclose(found[flat], wanted[flat], atol=0.02)
 
 
 def test_steep_surfaces_have_no_depth():
@@ -148,15 +128,13 @@ def test_steep_surfaces_have_no_depth():
         light = jnp.full(depth.shape, 0.5)
         given = jnp.asarray(depth, jnp.float32), jnp.asarray(depth > 0), light
         _, valid = _measure(jax.random.key(0), D415, EYE, *given)
-        middle = (slice(119, 121), slice(20, -20))
-        angle = np.degrees(np.arctan(height))
-        assert (angle > 10.0) == seen
-        assert np.asarray(valid)[middle].mean() == float(seen)
+        assert (np.degrees(np.arctan(height)) > 10.0) == seen
+        assert np.asarray(valid)[119:121, 20:-20].mean() == float(seen)
 
 
-def test_edges_lose_and_mix_pixels():
+def test_edges_lose_and_mix_pixels(picture: Picture):
     """Claim: beside a step of 10 cm half of the pixels are lost, a quarter lie between; elsewhere
-    none does. Leaving out pixels without support takes most of those, and no others."""
+    none does. Leaving out pixels without support takes most of those, and hardly others."""
     rows, cols = EYE.size[::-1]
     depth = np.where(np.arange(cols) < cols // 2, 0.9, 1.0) * np.ones((rows, 1))
     given = jnp.asarray(depth, jnp.float32), jnp.ones(depth.shape, bool), jnp.ones(depth.shape)
@@ -171,15 +149,10 @@ def test_edges_lose_and_mix_pixels():
     kept = np.asarray(_supported(jnp.asarray(np.where(valid, measured, 0.0)), EYE.focal[0]))
     assert (kept & off).sum() < 0.2 * (valid & off).sum()
     assert kept[:, ~edge].all()
-
-
-def test_support_of_exact_images(picture: Picture):
-    """Claim: of an exact image, all but one in two hundred of the pixels are kept."""
-    kept = np.asarray(_supported(jnp.asarray(picture.depth), EYE.focal[0]))
-    lone = picture.depth > 0
+    kept, lone = np.asarray(_supported(jnp.asarray(picture.depth), EYE.focal[0])), picture.depth > 0
+    assert not kept[~lone].any()
     lone[:, [0, -1]] = lone[[0, -1]] = False
     assert kept[lone].mean() > 0.995
-    assert not kept[picture.depth == 0].any()
 
 
 def test_image_of_another_renderer(picture: Picture):

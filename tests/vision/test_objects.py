@@ -1,11 +1,10 @@
-"""Objects of many convex parts, seen by our rays and by C MuJoCo's."""
+"""Objects of many convex parts and blocks of every kind, seen by our rays and by C MuJoCo's."""
 
 import functools
 import subprocess
 import sys
 
 import jax
-import mujoco
 import numpy as np
 import pytest
 
@@ -13,10 +12,12 @@ from csac_jax import geometry
 from csac_jax.config import CameraConfig, Config
 from csac_jax.vision import camera, observe
 from csac_jax.vision.heightmap import VIEW_HEIGHT
-from csac_jax.world import model, object_slots, scene_state
+from csac_jax.world import blocks, model, object_slots, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.vision import mujoco_rays
 
-KINDS = ("object", "object", "box", "object", "arch")  # C's rays do not follow scaled meshes
+SHAPES = tuple(shape.kind for shape in blocks.SHAPES.values())
+KINDS = ("object", "object", *dict.fromkeys(SHAPES))
 CONFIG = Config().change(
     scene={"slots": KINDS, "min_blocks": 1, "objects": "procedural:0:60", "split": "all"},
     sim={"physics": "c"},
@@ -26,11 +27,12 @@ CONFIG = Config().change(
 
 @pytest.fixture(scope="module")
 def world() -> model.World:
-    return model.build(CONFIG.scene, CONFIG.sim)
+    with mujoco_rays.nominal_meshes():
+        return model.build(CONFIG.scene, CONFIG.sim)
 
 
 def scattered(rng: np.random.Generator) -> SceneState:
-    """A scene with random objects and blocks in random poses over the square."""
+    """A scene with random objects and a block of each kind in random poses over the square."""
     num = len(KINDS)
     quaternion = rng.normal(size=(num, 4))
     scene = scene_state.parked(KINDS).replace(
@@ -42,29 +44,7 @@ def scattered(rng: np.random.Generator) -> SceneState:
     return object_slots.drawn(rng, CONFIG.scene, scene)
 
 
-def in_c(world: model.World, scene: SceneState) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The scene in C MuJoCo, the hand high above."""
-    exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
-    data = mujoco.MjData(exact)
-    data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-    data.qpos[world.robot_qpos[2]] = 3.0
-    mujoco.mj_kinematics(exact, data)
-    return exact, data
-
-
-def met(placed: tuple, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [R] and geoms [R] of rays [R, 3] by C MuJoCo."""
-    geom, found = np.zeros((1, 1), np.int32), []
-    for start, along in zip(origin, direction, strict=True):
-        distance = mujoco.mj_ray(*placed, start[:, None], along[:, None], None, 1, -1, geom, None)
-        found.append((distance, int(geom[0, 0])))
-    distances, geoms = zip(*found, strict=True)
-    return np.array(distances), np.array(geoms)
-
-
-@functools.cache
-def from_above():
-    return jax.jit(functools.partial(observe.observe, CONFIG))
+from_above = jax.jit(functools.partial(observe.observe, CONFIG))
 
 
 def compare(world: model.World, seeds: range) -> float:
@@ -75,8 +55,8 @@ def compare(world: model.World, seeds: range) -> float:
     apart = []
     for seed in seeds:
         scene = scattered(np.random.default_rng(seed)).replace(target=np.int32(seed % len(KINDS)))
-        obs = jax.device_get(from_above()(scene))
-        distance, geom = met(in_c(world, scene), origin, down)
+        obs = jax.device_get(from_above(scene))
+        distance, geom, _ = mujoco_rays.cast(*mujoco_rays.placed(world, scene), origin, down)
         apart.append(np.abs(obs.height.ravel() - (VIEW_HEIGHT - distance)) > 1e-4)
         own = world.slot_of_geom[geom] == scene.target
         assert np.mean(own != obs.target.ravel()) < 1e-3
@@ -84,15 +64,10 @@ def compare(world: model.World, seeds: range) -> float:
     return float(np.mean(apart))
 
 
-def test_heights_of_objects_agree_with_mujoco(world: model.World):
+@pytest.mark.parametrize("views", [12, pytest.param(1000, marks=pytest.mark.slow)])
+def test_heights_of_objects_agree_with_mujoco(world: model.World, views: int):
     """Claim: heights of objects in random poses are C's to 0.1 mm off edges, targets too."""
-    assert compare(world, range(12)) < 5e-5
-
-
-@pytest.mark.slow
-def test_a_thousand_views_agree_with_mujoco(world: model.World):
-    """Claim: so on 1,000 views."""
-    assert compare(world, range(1000)) < 5e-5
+    assert compare(world, range(views)) < 5e-5
 
 
 def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
@@ -104,10 +79,11 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
         return observe.cast_pixels(CONFIG, camera.make(CONFIG.camera), shapes).distance
 
     rays = np.asarray(camera.directions(camera.make(CONFIG.camera)), np.float64).reshape(-1, 3)
-    origin = np.tile(CONFIG.camera.position, (len(rays), 1))
     for seed in range(6):
         scene = scattered(np.random.default_rng(seed))
-        distance, _ = met(in_c(world, scene), origin, rays)
+        distance = mujoco_rays.cast(
+            *mujoco_rays.placed(world, scene), CONFIG.camera.position, rays
+        ).distance
         apart = np.abs(np.asarray(depths(scene)).ravel() - distance) > 1e-4
         assert apart.mean() < 1e-4, seed
 
@@ -122,8 +98,5 @@ def test_windows_are_smaller_than_the_view():
 
 def test_observation_needs_no_mujoco():
     """Claim: objects are seen without MuJoCo."""
-    code = (
-        "import sys; from csac_jax.vision import observe; from csac_jax.scene import stock;"
-        "assert 'mujoco' not in sys.modules"
-    )
+    code = "import sys, csac_jax.vision.observe; assert 'mujoco' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
