@@ -19,7 +19,6 @@ from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint, files
-from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo
 
@@ -121,7 +120,7 @@ def _best_score(folder: Path, step: int) -> Score:
         return ()
     try:
         return tuple(checkpoint.load_extra(folder)["score"])
-    except CheckpointError as error:
+    except checkpoint.CheckpointError as error:
         warnings.warn(f"{error}; the next evaluation is the best", DataWarning, stacklevel=2)
     checkpoint.set_aside_after(folder, -1)
     return ()

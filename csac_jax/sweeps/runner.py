@@ -31,7 +31,6 @@ from csac_jax.io import checkpoint, configs, files, lock, renames
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import grid
-from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
 from csac_jax.training.callbacks import Record
@@ -52,7 +51,7 @@ class SweepPlan(NamedTuple):
     """The runs of a sweep: every point with seeds cfg.seed, cfg.seed + 1, ..."""
 
     seeds: int
-    points: list[SweepPoint]
+    points: list[grid.SweepPoint]
     episodes: int = 0  # that every final policy is evaluated in
 
 
@@ -134,7 +133,7 @@ def _parse_plan(stored: dict[str, Any]) -> SweepPlan:
     points = []
     for point in stored["settings"]:
         values = dict(renames.current_setting(*pair) for pair in point["values"].items())
-        points.append(SweepPoint(point["name"], values, configs.from_dict(point["config"])))
+        points.append(grid.SweepPoint(point["name"], values, configs.from_dict(point["config"])))
     return SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
 
 

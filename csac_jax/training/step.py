@@ -16,7 +16,6 @@ from csac_jax.agent import augment
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.config import Config
-from csac_jax.env import Env
 from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 from csac_jax.replay.samplers import Sampler
@@ -41,7 +40,7 @@ class Program:
     """The static parts of a run, closed over by what is compiled."""
 
     cfg: Config
-    env: Env
+    env: environment.Env
     learner: Learner
     sampler: Sampler
     mesh: Mesh | None = None  # whose devices divide scenes and batches
