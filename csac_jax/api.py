@@ -96,7 +96,8 @@ def train(
         cached = (learner, sampler, network) == (None, None, None)
         follower = followers.joined(callbacks)
         if plan is not None:
-            watch = monitor.Monitor(cfg, plan, follower, terminal.log, network, learner)
+            policy = lambda state: policies.policy_from_state(cfg, state, network, learner)  # noqa: E731
+            watch = monitor.Monitor(cfg, plan, policy, follower, terminal.log)
             follower = followers.joined([follower, watch])
         begin = programs.compile_init(program)
 
@@ -210,9 +211,7 @@ def evaluate_sweep(folder: Path, suite: str, episodes: int, stop: signals.Stop) 
 
 def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
     """Returns a function that puts the networks of `source`, see `train`, into an initial state.
-
-    Raises SettingsError if they are not those of the config.
-    """
+    Raises SettingsError if they are not those of the config."""
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):

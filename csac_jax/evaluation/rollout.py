@@ -68,11 +68,9 @@ def rollout(
     seed: int,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
-    """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
-
-    Some run side by side; where one ends, the next begins. An episode's draws follow from the seed
-    and its number alone. `on_progress` gets the episodes finished and all.
-    """
+    """Runs episodes of a policy, their scenes spread evenly over the environment's pool. Some run
+    side by side; where one ends, the next begins. An episode's draws follow from the seed and its
+    number alone. `on_progress` gets the episodes finished and all."""
     most = min(SIDE_BY_SIDE, episodes)
     if jax.default_backend() == "cpu":
         most = min(most, PER_CORE * len(os.sched_getaffinity(0)))
@@ -213,10 +211,8 @@ def _step(
     env: Env, kind: type, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
 ) -> tuple[State, Episodes]:
     """Takes one action in every scene; records [E] are 0 after the end. Finished scenes stay.
-
     `kind`, the policy's type, is static: JAX takes dataclasses of equal fields for equal whatever
-    their types are, and would at times run the program of the one for the other.
-    """
+    their types are, and would at times run the program of the one for the other."""
     del kind
     running = ~states.done
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)

@@ -126,4 +126,5 @@ def _arrays(buffers: Any) -> list[np.ndarray]:
 def _array(buffer: Any) -> np.ndarray:
     shape, dtype = tuple(buffer.dims[: buffer.rank]), np.dtype(_TYPES[buffer.type])
     size = int(np.prod(shape)) * dtype.itemsize
-    return np.ndarray(shape, dtype, (ctypes.c_byte * size).from_address(buffer.data or 0))
+    memory: Any = (ctypes.c_byte * size).from_address(buffer.data or 0)
+    return np.ndarray(shape, dtype, memory)

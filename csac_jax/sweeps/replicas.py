@@ -191,10 +191,8 @@ def sweep_program(
 
 def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
     """Returns how many parts are best for so many replicas, see `Pipelined`; on a GPU at most two.
-
     One on several devices, for DenseNet-121, which keeps a device busy, and where the states do not
-    fit twice: they are taken apart and joined again.
-    """
+    fit twice: they are taken apart and joined again."""
     even = cfg.sim.physics == "c" and replicas % 2 == 0
     parts = replicas if jax.default_backend() == "cpu" else 2 if even else 1
     if parts == 1 or mesh is not None or not isinstance(cfg.net, SmallNet):

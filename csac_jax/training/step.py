@@ -47,10 +47,8 @@ class Program:
 
 
 def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
-    """Takes one action in each of the E scenes and makes the updates that belong to it.
-
-    On a CPU each half is a program of its own, see `split_step`; elsewhere both are one.
-    """
+    """Takes one action in each of the E scenes and makes the updates that belong to it. On a CPU
+    each half is a program of its own, see `split_step`; elsewhere both are one."""
     acted, metrics = act_half(program, state)
     # ---- acting ends, learning begins
     return learn_half(program, acted, metrics)
