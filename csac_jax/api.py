@@ -17,19 +17,15 @@ from csac_jax.config import Config, DenseNet121, SmallNet
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor, policies, rollout
-from csac_jax.evaluation.monitor import EvalPlan
-from csac_jax.evaluation.policies import NetworkPolicy, Policy
 from csac_jax.io import leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
 from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
-from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
 from csac_jax.training import callbacks as followers, loop, memory, programs, sharding, split_step
 from csac_jax.training.callbacks import Callback, Record, Summary
 from csac_jax.training.progress import Terminal
-from csac_jax.training.sharding import Shard
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
 
@@ -47,7 +43,7 @@ class Run(NamedTuple):
     parts: dict[str, Any]  # the network and learner given, as `load_policy` takes them
 
     @property
-    def policy(self) -> Policy:
+    def policy(self) -> policies.Policy:
         """Returns the policy of the last checkpoint."""
         return load_policy(self.run_dir, **self.parts)
 
@@ -89,7 +85,10 @@ def train(
     if resume:
         loop.check_resumable(cfg, folder, at)
     start = initial_networks(cfg, init)
-    plan = _eval_plan(folder, resume, EvalPlan(eval_every, eval_suite, eval_episodes))
+    plan = monitor.read_plan(folder) if resume and not eval_every else None
+    if eval_every:
+        plan = monitor.EvalPlan(eval_every, eval_suite, eval_episodes)
+        plan.check()
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
         terminal.log(_first_line(folder, cfg))
@@ -97,7 +96,8 @@ def train(
         cached = (learner, sampler, network) == (None, None, None)
         follower = followers.joined(callbacks)
         if plan is not None:
-            watch = monitor.Monitor(cfg, plan, follower, terminal.log, network, learner)
+            policy = lambda state: policies.policy_from_state(cfg, state, network, learner)  # noqa: E731
+            watch = monitor.Monitor(cfg, plan, policy, follower, terminal.log)
             follower = followers.joined([follower, watch])
         begin = programs.compile_init(program)
 
@@ -142,7 +142,7 @@ def sweep(
     run_dir: str | Path | None = None,
     *,
     devices: int | None = None,
-    shard: Shard = "seeds",
+    shard: sharding.Shard = "seeds",
     init: str | Path | None = None,
     episodes: int = 0,
     verbose: bool = True,
@@ -156,20 +156,20 @@ def sweep(
     policy is evaluated in. Returns: the summary, grasp success of every combination over its seeds
     with 95 % intervals. Raises as `train`.
     """
-    points = _points(cfg, dict(vary or {}))
-    runner.check_plan(SweepPlan(seeds, points, episodes))
-    place = devices or 1, seeds * len(points)
-    points = [point._replace(cfg=backend.resolve(point.cfg, *place)) for point in points]
+    plan = SweepPlan(seeds, _points(cfg, dict(vary or {})), episodes)
+    runner.check_plan(plan)
+    room = devices or 1, seeds * len(plan.points)
+    points = [point._replace(cfg=backend.resolve(point.cfg, *room)) for point in plan.points]
+    plan, stop = plan._replace(points=points), stop or signals.Stop()
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
-    plan = SweepPlan(seeds, points, episodes)
-    return run_sweep(plan, folder, devices, shard, init, verbose, stop or signals.Stop()).summary
+    return run_sweep(plan, folder, devices, shard, init, verbose, stop).summary
 
 
 def run_sweep(
     plan: SweepPlan,
     folder: Path,
     devices: int | None,
-    shard: Shard,
+    shard: sharding.Shard,
     init: str | Path | None,
     verbose: bool,
     stop: signals.Stop,
@@ -178,10 +178,9 @@ def run_sweep(
     """Runs what is left of a sweep's plan, see `sweep`."""
     cache.enable()
     mesh = sharding.make(devices)
-    for point in plan.points:
-        scenes, batch = point.cfg.train.scenes, point.cfg.learn.batch
-        sharding.check(mesh, shard, plan.seeds, scenes, batch)
-        initial_networks(point.cfg, init)
+    for cfg in (point.cfg for point in plan.points):
+        sharding.check(mesh, shard, plan.seeds, cfg.train.scenes, cfg.learn.batch)
+        initial_networks(cfg, init)
     runner.check_room(plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
@@ -212,16 +211,14 @@ def evaluate_sweep(folder: Path, suite: str, episodes: int, stop: signals.Stop) 
 
 def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], Any] | None:
     """Returns a function that puts the networks of `source`, see `train`, into an initial state.
-
-    Raises SettingsError if they are not those of the config.
-    """
+    Raises SettingsError if they are not those of the config."""
     if source is None:
         return None
     if isinstance(cfg.net, DenseNet121) and _is_weights(source):
         trunk = weights.read(cfg.net, Path(source))
         return lambda state: actor_critic.with_trunk(state, trunk)
     policy = policies.load(source)
-    assert isinstance(policy, NetworkPolicy)
+    assert isinstance(policy, policies.NetworkPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
     # Inputs may be missing at the end: colours, heights, gripper and target are in this order.
     if policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour:
@@ -251,20 +248,13 @@ def new_folder(name: str) -> Path:
     return next(path for path in candidates if not path.exists())
 
 
-def _eval_plan(folder: Path, resume: bool, plan: EvalPlan) -> EvalPlan | None:
-    if not plan.every:
-        return monitor.read_plan(folder) if resume else None
-    plan.check()
-    return plan
-
-
 def _is_weights(source: str | Path) -> bool:
     """Returns True if `source` is a file of weights and no policy."""
     path = Path(source)
     return source != "shipped" and path.is_file() and not policy_file.is_policy(path)
 
 
-def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[SweepPoint]:
+def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[grid.SweepPoint]:
     for name in vary:
         grid.kind_of(name)
 

@@ -6,11 +6,9 @@ from pathlib import Path
 
 
 def private(*parts: str) -> Path | None:
-    """Makes the folder CACHE/csac_jax/PARTS of this user, with mode 0700.
-
-    CACHE is XDG_CACHE_HOME or ~/.cache. Returns None if there is no home, the folder cannot be
-    written, or another user owns it or can write into it.
-    """
+    """Makes the folder CACHE/csac_jax/PARTS of this user, with mode 0700. CACHE is XDG_CACHE_HOME
+    or ~/.cache. Returns None if there is no home, the folder cannot be written, or another user
+    owns it or can write into it."""
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         Path(home).mkdir(parents=True, exist_ok=True)

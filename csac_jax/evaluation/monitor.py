@@ -13,13 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.evaluation import policies, rollout, suites
+from csac_jax.evaluation import rollout, suites
+from csac_jax.evaluation.policies import Policy
 from csac_jax.io import checkpoint, files
-from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo
 
@@ -51,19 +50,18 @@ class Monitor(Callback):
         self,
         cfg: Config,
         plan: EvalPlan,
+        make_policy: Callable[[Any], Policy],
         callback: Callback,
         log: Callable[[str], None],
-        network: Any = None,
-        learner: Learner | None = None,
     ) -> None:
         """Settles the scenes. Raises SettingsError for a suite that does not fit the policy.
 
-        Args: callback, whose `evaluated` is called; log, takes a line about each evaluation;
-        network and learner, of a run with custom parts.
+        Args: make_policy, of a learner's state; callback, whose `evaluated` is called; log, takes a
+        line about each evaluation.
         """
         self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
-        self._cfg, self._plan, self._callback, self._log = cfg, plan, callback, log
-        self._network, self._learner = network, learner
+        self._cfg, self._plan, self._policy = cfg, plan, make_policy
+        self._callback, self._log = callback, log
         self._best: Score = ()
         self._done = 0  # actions before the chunk that comes next
 
@@ -82,14 +80,13 @@ class Monitor(Callback):
             self._evaluate(record, state)
 
     def _evaluate(self, record: Record, state: Any) -> None:
-        begun, folder = time.time(), self._run_dir / files.BEST
-        policy = policies.policy_from_state(self._cfg, state.learner, self._network, self._learner)
-        table = rollout.evaluate(policy, self._suite)
+        begun = time.time()
+        table = rollout.evaluate(self._policy(state.learner), self._suite)
         score = score_of(table)
         if best := score > self._best:
             self._best = score
             extra = {"seconds": record.seconds, "grasps": [], "score": score}
-            checkpoint.save(folder, record.step, state, self._cfg, extra)
+            checkpoint.save(self._run_dir / files.BEST, record.step, state, self._cfg, extra)
         self._write(record, round(time.time() - begun, 3), score, best, table)
         values = [f"{name} {value:.1%}" for name, value in zip(JUDGED, score, strict=True)]
         line = f"evaluated on {self._plan.suite} at {record.actions} actions: {', '.join(values)}"
@@ -121,7 +118,7 @@ def _best_score(folder: Path, step: int) -> Score:
         return ()
     try:
         return tuple(checkpoint.load_extra(folder)["score"])
-    except CheckpointError as error:
+    except checkpoint.CheckpointError as error:
         warnings.warn(f"{error}; the next evaluation is the best", DataWarning, stacklevel=2)
     checkpoint.set_aside_after(folder, -1)
     return ()

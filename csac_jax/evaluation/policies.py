@@ -13,7 +13,6 @@ from flax import struct
 
 from csac_jax import geometry
 from csac_jax.agent import actor_critic, maps, policy, values
-from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.learner import Learner
 from csac_jax.baselines import antipodal, oracle
 from csac_jax.config import Config
@@ -52,7 +51,7 @@ class NetworkPolicy:
     which pushes after no visible change, and with `policy.retry_temperature`, it needs a State."""
 
     cfg: Config = struct.field(pytree_node=False)
-    params: Params
+    params: actor_critic.Params
     network: Any = struct.field(pytree_node=False, default=None)  # a custom critic
 
     @jax.jit
@@ -206,7 +205,6 @@ def policy_from_state(
 
 
 def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
-    """Finds the folder and step of a checkpoint; no step for the newest sound one."""
     if which != "best":
         return run_dir, None if which == "last" else int(which)
     if not (best := run_dir / files.BEST).exists():
@@ -224,8 +222,7 @@ def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
         known = ", ".join(("learned", *BASELINES))
         raise ValueError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
     build = BASELINES[kind] if kind in BASELINES else _imported(kind)
-    policy: Policy = build(load_config(source, which))
-    return policy
+    return build(load_config(source, which))
 
 
 def _imported(path: str) -> Callable[[Config], Policy]:

@@ -16,15 +16,12 @@ from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import NetworkPolicy, Policy, PolicyDebug
-from csac_jax.evaluation.suites import PreparedSuite
 from csac_jax.objects.library import Split
 from csac_jax.robot import primitives
-from csac_jax.robot.primitives import Action, JointTrajectory
 from csac_jax.runtime import compiler
 from csac_jax.sim import physics as simulation
 from csac_jax.training import transitions
 from csac_jax.world import object_slots, scene_state
-from csac_jax.world.scene_state import SceneState
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
@@ -34,7 +31,7 @@ OnProgress = Callable[[str, int, int], None]  # part of the suite, episodes fini
 
 def evaluate(
     policy: Policy,
-    suite: str | PreparedSuite = suites.IN_DISTRIBUTION,
+    suite: str | suites.PreparedSuite = suites.IN_DISTRIBUTION,
     episodes: int = 50,
     seed: int = 0,
     physics: PhysicsKind = "auto",
@@ -49,7 +46,7 @@ def evaluate(
     which has the other arguments; on_progress, called after every action. Returns: the metrics; of
     a suite with several parts {"parts": {name: metrics}}. Raises ValueError as `suites.prepare`.
     """
-    if not isinstance(suite, PreparedSuite):
+    if not isinstance(suite, suites.PreparedSuite):
         learned = isinstance(policy, NetworkPolicy)
         suite = suites.prepare(
             policy.cfg, suite, episodes, seed, physics, robot, objects, split, learned
@@ -71,11 +68,9 @@ def rollout(
     seed: int,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Episodes:
-    """Runs episodes of a policy, their scenes spread evenly over the environment's pool.
-
-    Some run side by side; where one ends, the next begins. An episode's draws follow from the seed
-    and its number alone. `on_progress` gets the episodes finished and all.
-    """
+    """Runs episodes of a policy, their scenes spread evenly over the environment's pool. Some run
+    side by side; where one ends, the next begins. An episode's draws follow from the seed and its
+    number alone. `on_progress` gets the episodes finished and all."""
     most = min(SIDE_BY_SIDE, episodes)
     if jax.default_backend() == "cpu":
         most = min(most, PER_CORE * len(os.sched_getaffinity(0)))
@@ -147,8 +142,8 @@ class StepRecord(NamedTuple):
     """One action of an episode; NumPy leaves of one scene."""
 
     before: State
-    action: Action
-    joints: JointTrajectory
+    action: primitives.Action
+    joints: primitives.JointTrajectory
     after: State
     reward: jax.Array  # [] R of CSAC eq. 12 for a learned policy; else `after.reward`
     debug: PolicyDebug | None  # of a learned policy
@@ -205,7 +200,7 @@ def endings(env: Env, last: State) -> np.ndarray:
     return np.select(jax.device_get([*reasons.values()]), chosen, default)
 
 
-def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: SceneState) -> State:
+def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: scene_state.SceneState) -> State:
     """Builds the first states of the episodes `numbers` [E] in `scenes` [E, ...]."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, numbers)
     placed = jax.vmap(env.randomise_pose)(keys, jax.tree.map(jnp.asarray, scenes))
@@ -215,12 +210,9 @@ def _begin(env: Env, key: jax.Array, numbers: jax.Array, scenes: SceneState) -> 
 def _step(
     env: Env, kind: type, policy: Policy, key: jax.Array, numbers: jax.Array, states: State
 ) -> tuple[State, Episodes]:
-    """Takes one action in every scene; records [E] are 0 after the end. Finished scenes stay, and
-    physics has nothing to do there.
-
+    """Takes one action in every scene; records [E] are 0 after the end. Finished scenes stay.
     `kind`, the policy's type, is static: JAX takes dataclasses of equal fields for equal whatever
-    their types are, and would at times run the program of the one for the other.
-    """
+    their types are, and would at times run the program of the one for the other."""
     del kind
     running = ~states.done
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(states.actions + 1)
@@ -228,20 +220,18 @@ def _step(
     action = act(states, jax.vmap(jax.random.fold_in)(keys, numbers))
     cleared = jax.vmap(scene_state.park)(states.scene, running[:, None] & states.scene.in_play)
     after = jax.vmap(env.step)(states.replace(scene=cleared), action)
-    info, has_target = after.info, env.cfg.task.kind == "target"
-    target_lost = (after.terminated & (after.reward == 0.0)).astype(jnp.int32)
+    info, has_target, unpaid = after.info, env.cfg.task.kind == "target", after.reward == 0.0
+    target_lost = (after.terminated & unpaid).astype(jnp.int32)
+    reachable = jax.vmap(functools.partial(simulation.reachable, env.cfg))
     record = Episodes(
         valid=running,
         primitive=action.primitive,
         outcome=info.outcome,
         cleared=after.reward.astype(jnp.int32) if has_target else info.cleared,
         changed=info.moved > CHANGE_AREA,
-        wrong=(info.cleared > 0) & (after.reward == 0.0) & has_target,
+        wrong=(info.cleared > 0) & unpaid & has_target,
         blocks_lost=target_lost if has_target else info.blocks_lost,
-        unreachable=~jax.vmap(functools.partial(simulation.reachable, env.cfg))(
-            states.obs.height, action
-        ),
+        unreachable=~reachable(states.obs.height, action),
     )
     record = jax.tree.map(lambda leaf: jnp.where(running, leaf, jnp.zeros_like(leaf)), record)
-    keep = jax.vmap(jnp.where)
-    return jax.tree.map(lambda new, old: keep(running, new, old), after, states), record
+    return transitions.where(running, after, states), record

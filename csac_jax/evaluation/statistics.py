@@ -31,11 +31,9 @@ def by_seed(seeds: Sequence[int], values: Sequence[Any] | np.ndarray) -> list[np
 
 
 def band(strata: Sequence[Stratum], seed: int = 0) -> Band:
-    """Averages over strata (tasks) the IQM over each one's seeds, drawn within each stratum.
-
-    Unlike Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out
-    the hardest. Raises ValueError where a stratum is empty.
-    """
+    """Averages over strata (tasks) the IQM over each one's seeds, drawn within each stratum. Unlike
+    Agarwal et al. there is no IQM over all strata at once: of four cases it would leave out the
+    hardest. Raises ValueError where a stratum is empty."""
     return _bands(strata, _mean_iqm, seed)[0]
 
 

@@ -29,9 +29,7 @@ _hits: collections.Counter[int] = collections.Counter()  # programs found, by th
 
 def enable() -> Path | None:
     """Switches the cache on and returns its folder; None if it is off or not private.
-
-    JAX_COMPILATION_CACHE_DIR chooses the folder, JAX_ENABLE_COMPILATION_CACHE=0 switches it off.
-    """
+    JAX_COMPILATION_CACHE_DIR chooses the folder, JAX_ENABLE_COMPILATION_CACHE=0 switches it off."""
     if not jax.config.jax_enable_compilation_cache:
         return None
     _listen()

@@ -40,9 +40,7 @@ def lower(jitted: Any, *inputs: Any) -> Any:
 
 def options(cfg: Config) -> dict[str, Any] | None:
     """Returns the options of `jax.jit` for the config's training program; None for the defaults.
-
-    The second library is slow at kernel gradients, which `nets.convolution` keeps from it.
-    """
+    The second library is slow at kernel gradients, which `nets.convolution` keeps from it."""
     small, backend = isinstance(cfg.net, SmallNet), jax.default_backend()
     if backend == "cpu":
         flags = os.environ.get("XLA_FLAGS", "")

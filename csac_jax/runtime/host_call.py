@@ -12,7 +12,7 @@ import ctypes
 import functools
 from collections.abc import Callable
 from ctypes import POINTER, c_char_p, c_int, c_int64, c_size_t, c_uint32, c_void_p
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,12 +22,7 @@ _METADATA, _INTERNAL = 1, 13  # XLA_FFI_Extension_Metadata, XLA_FFI_Error_Code_I
 _TYPES = {1: np.bool_, 4: np.int32, 6: np.uint8, 8: np.uint32, 11: np.float32}  # XLA_FFI_DataType
 
 
-class _Function(NamedTuple):
-    call: Callable[..., Any]
-    arguments: Any  # tree structure
-
-
-_functions: dict[str, _Function] = {}
+_functions: dict[str, tuple[Callable[..., Any], Any]] = {}  # and the structure of its arguments
 
 
 def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -> Any:
@@ -38,7 +33,7 @@ def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -
     """
     _register()
     leaves, tree = jax.tree.flatten(arguments)
-    _functions[key] = _Function(function, tree)
+    _functions[key] = function, tree
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), result)
     called = jax.ffi.ffi_call(TARGET, jax.tree.leaves(shapes), vmap_method="broadcast_all")
     return jax.tree.unflatten(jax.tree.structure(shapes), called(*leaves, key=key))
@@ -116,8 +111,8 @@ def _tell_version(frame: Any) -> None:
 
 def _run(frame: Any) -> None:
     text = frame.attributes.values[0].contents
-    function = _functions[ctypes.string_at(text.start, text.length).decode()]
-    result = function.call(*jax.tree.unflatten(function.arguments, _arrays(frame.arguments)))
+    function, tree = _functions[ctypes.string_at(text.start, text.length).decode()]
+    result = function(*jax.tree.unflatten(tree, _arrays(frame.arguments)))
     for array, value in zip(_arrays(frame.results), jax.tree.leaves(result), strict=True):
         if array.shape != np.shape(value):
             raise ValueError(f"a result has the shape {np.shape(value)}, not {array.shape}")
@@ -129,10 +124,7 @@ def _arrays(buffers: Any) -> list[np.ndarray]:
 
 
 def _array(buffer: Any) -> np.ndarray:
-    shape = tuple(buffer.dims[: buffer.rank])
-    dtype: Any = np.dtype(_TYPES[buffer.type])
+    shape, dtype = tuple(buffer.dims[: buffer.rank]), np.dtype(_TYPES[buffer.type])
     size = int(np.prod(shape)) * dtype.itemsize
-    if not size:
-        return np.empty(shape, dtype)
-    memory: Any = (ctypes.c_byte * size).from_address(buffer.data)
-    return np.frombuffer(memory, dtype).reshape(shape)
+    memory: Any = (ctypes.c_byte * size).from_address(buffer.data or 0)
+    return np.ndarray(shape, dtype, memory)

@@ -3,9 +3,6 @@
 Tests of what is built on them show whether a new version of JAX still has them.
 """
 
-from typing import Any
-
-import jax
 from jax._src import compilation_cache
 
 
@@ -14,8 +11,3 @@ def compress_with_checksum() -> None:
     for name in ("zstd", "zstandard"):
         if hasattr(compilation_cache, name):
             setattr(compilation_cache, name, None)
-
-
-def settings() -> dict[str, Any]:
-    """Returns JAX's settings by name."""
-    return dict(jax.config.values)

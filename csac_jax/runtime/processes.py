@@ -20,11 +20,10 @@ _PAUSE = 0.2  # s between looks at the queue
 def cores() -> int:
     """Returns the cores that this process may use, within the quota of a container."""
     allowed = len(os.sched_getaffinity(0))
-    try:
-        quota, period = _QUOTA.read_text().split()
-        return max(1, min(allowed, int(quota) // int(period)))
-    except (OSError, ValueError):  # no container, or "max"
-        return allowed
+    with contextlib.suppress(OSError, ValueError):  # no container, or "max"
+        quota, period = map(int, _QUOTA.read_text().split())
+        return max(1, min(allowed, quota // period))
+    return allowed
 
 
 def each(

@@ -1,8 +1,7 @@
 """SIGINT and SIGTERM: the first makes the loop save and end, a later one ends it at once.
 
-Python runs its own signal handlers between bytecodes, so not while XLA compiles or a chunk runs.
-The C handler behind `signal.set_wakeup_fd` does not wait: it writes the signal's number into a
-socket, which a thread reads.
+Python's own signal handlers wait while XLA compiles or a chunk runs. The C handler behind
+`signal.set_wakeup_fd` does not: it writes the signal's number into a socket, which a thread reads.
 """
 
 import os

@@ -25,10 +25,8 @@ def measure(
     plan: SweepPlan, folder: Path, reporter: Reporter, stop: Stop, suite: str = OWN
 ) -> int | None:
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
-
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
-    ValueError as `suites.prepare` does, before anything is measured there.
-    """
+    ValueError as `suites.prepare` does, before anything is measured there."""
     name = "eval.json" if suite == OWN else f"eval-{Path(suite).stem}.json"
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))

@@ -14,7 +14,6 @@ from csac_jax.config import ALTERNATIVES, Config, Section
 from csac_jax.errors import SettingsError
 from csac_jax.io import renames
 
-BASE = "base"  # name of the only point where nothing is varied
 LONGEST = 120  # characters of a point's name, which is a folder's
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
 TASKS: dict[str, dict[str, Any]] = {
@@ -53,11 +52,9 @@ class SweepPoint(NamedTuple):
 
 
 def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> list[SweepPoint]:
-    """Combines the values of `NAME=A,B,...`; the last name's values change fastest.
-
-    `configure` makes a config of flags. Colons separate the items of a tuple, as in
-    `replay.end=1:4,1:12`. Raises SettingsError for what cannot be varied.
-    """
+    """Combines the values of `NAME=A,B,...`; the last name's values change fastest. `configure`
+    makes a config of flags. Colons separate the items of a tuple, as in `replay.end=1:4,1:12`.
+    Raises SettingsError for what cannot be varied."""
     axes = dict(map(_axis, varied))
     if len(axes) < len(varied):
         raise SettingsError("vary: a setting is given twice; name it once, with all its values")
@@ -68,18 +65,16 @@ def points(varied: Sequence[str], configure: Callable[[list[str]], Config]) -> l
 def combine(
     axes: Mapping[str, Sequence[Any]], configure: Callable[[dict[str, Any]], Config]
 ) -> list[SweepPoint]:
-    """Makes a point of every combination, setting -> value; `configure` makes its config.
-
-    Points are numbered if one has a name that is too long for a folder. Raises SettingsError for
-    too many.
-    """
-    points: list[SweepPoint] = []
+    """Makes a point of every combination, setting -> value; `configure` makes its config. Points
+    are numbered if one has a name that is too long for a folder. Raises SettingsError for too
+    many."""
     if math.prod(map(len, axes.values())) > MOST_RUNS:
         raise SettingsError(f"vary: more than {MOST_RUNS} combinations; leave some values out")
+    points: list[SweepPoint] = []
     for combination in itertools.product(*axes.values()):
         values = dict(zip(axes, combination, strict=True))
-        name = ",".join(f"{setting}={value}" for setting, value in values.items()) or BASE
         texts = {setting: str(value) for setting, value in values.items()}
+        name = ",".join(map("=".join, texts.items())) or "base"
         points.append(SweepPoint(name, texts, configure(values)))
     if all(len(point.name) <= LONGEST for point in points):
         return points
@@ -97,9 +92,7 @@ def _axis(text: str) -> tuple[str, list[str]]:
     if len(set(values)) < len(values):
         raise SettingsError(f"vary {text}: a value is given twice")
     if not all(map(_VALUE.fullmatch, values)):
-        raise SettingsError(
-            f"vary {text}: a value must hold no slash, nor begin with a dot or dash"
-        )
+        raise SettingsError(f"vary {text}: a value holds no slash and begins with no dot or dash")
     return name, values
 
 

@@ -20,10 +20,8 @@ from csac_jax.agent.csac import CSAC
 from csac_jax.config import Config, SmallNet
 from csac_jax.io import configs
 from csac_jax.nets import chunked_vmap
-from csac_jax.nets.chunked_vmap import Batching
 from csac_jax.runtime import compiler
 from csac_jax.training import memory, programs, step
-from csac_jax.training.programs import Hyperparams
 from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -53,7 +51,7 @@ class Replicas(NamedTuple):
     """Seeds and settings of replicas."""
 
     seed: Any  # [S] uint32
-    hyperparams: Hyperparams | None  # leaves [S, ...] float32; None if only the seeds differ
+    hyperparams: programs.Hyperparams | None  # leaves [S, ...]; None if only the seeds differ
 
 
 class ProgramGroup(NamedTuple):
@@ -94,7 +92,7 @@ def group_replicas(group: ProgramGroup) -> Replicas:
     values = {name: np.array([row[name] for row in traced], np.float32) for name in names}
     bounds = [rewards.bounds(cfg.reward, cfg.target.gamma) for cfg in cfgs]
     low, high = np.array(bounds, np.float32).T
-    return Replicas(seed, Hyperparams(values, (low, high)))
+    return Replicas(seed, programs.Hyperparams(values, (low, high)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,13 +153,13 @@ class SweepProgram:
         places = (self._shardings(), NamedSharding(mesh, _WHOLE))
         return jit(lambda state: chunk(state, replicas), out_shardings=places)
 
-    def _batching(self, vmapped: int) -> Batching:
+    def _batching(self, vmapped: int) -> chunked_vmap.Batching:
         """Returns how the networks of so many runs work under `vmap`; in no chunks where scenes are
         sharded or hyper-parameters traced: `vmap_in_chunks` cannot close over them."""
         sharded = self.mesh is not None and self.shard == "scenes"
         chunked = not sharded and self.replicas.hyperparams is None
         at_once = chunked_vmap.chunk_size(self.program.cfg, vmapped) if chunked else None
-        return Batching(side_by_side=vmapped > 1, networks_at_once=at_once)
+        return chunked_vmap.Batching(side_by_side=vmapped > 1, networks_at_once=at_once)
 
     def replica(self, state: TrainState, index: int) -> TrainState:
         """Returns the state of one replica, as `train` has it, on every device."""
@@ -193,10 +191,8 @@ def sweep_program(
 
 def num_parts(cfg: Config, replicas: int, mesh: Mesh | None = None) -> int:
     """Returns how many parts are best for so many replicas, see `Pipelined`; on a GPU at most two.
-
     One on several devices, for DenseNet-121, which keeps a device busy, and where the states do not
-    fit twice: they are taken apart and joined again.
-    """
+    fit twice: they are taken apart and joined again."""
     even = cfg.sim.physics == "c" and replicas % 2 == 0
     parts = replicas if jax.default_backend() == "cpu" else 2 if even else 1
     if parts == 1 or mesh is not None or not isinstance(cfg.net, SmallNet):

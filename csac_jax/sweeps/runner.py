@@ -31,7 +31,6 @@ from csac_jax.io import checkpoint, configs, files, lock, renames
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import grid
-from csac_jax.sweeps.grid import SweepPoint
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
 from csac_jax.training.callbacks import Record
@@ -52,7 +51,7 @@ class SweepPlan(NamedTuple):
     """The runs of a sweep: every point with seeds cfg.seed, cfg.seed + 1, ..."""
 
     seeds: int
-    points: list[SweepPoint]
+    points: list[grid.SweepPoint]
     episodes: int = 0  # that every final policy is evaluated in
 
 
@@ -86,8 +85,8 @@ def run(
 ) -> SweepResult:
     """Runs what is left of a sweep, or until `stop.signal` is set; saves in both cases.
 
-    Args: folder, made unless `resume`; make_program, called once for each group that is not done.
-    Raises CheckpointError if a checkpoint is damaged.
+    Args: folder, made unless `resume`; make_program, called for each group that is not done. Raises
+    CheckpointError if a checkpoint is damaged.
     """
     checkpoint.check_path(folder)
     cluster.wait("sweep")  # all have looked whether there is such a folder
@@ -134,7 +133,7 @@ def _parse_plan(stored: dict[str, Any]) -> SweepPlan:
     points = []
     for point in stored["settings"]:
         values = dict(renames.current_setting(*pair) for pair in point["values"].items())
-        points.append(SweepPoint(point["name"], values, configs.from_dict(point["config"])))
+        points.append(grid.SweepPoint(point["name"], values, configs.from_dict(point["config"])))
     return SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
 
 
@@ -243,11 +242,9 @@ class _Sweep:
             values = [getattr(record, name) for record in records]
             return loop.mean([value for value in values if value is not None])
 
-        actions = [
-            sum(loop.total_steps(run.cfg) * run.cfg.train.scenes for run in runs)
-            for _, runs in self.groups
-        ]
-        done = sum(actions[:index]) + records[0].actions * len(self.groups[index][1])
+        cfgs = [[run.cfg for run in runs] for _, runs in self.groups]
+        actions = [sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in group) for group in cfgs]
+        done = sum(actions[:index]) + records[0].actions * len(cfgs[index])
         total, speed = sum(actions), sum(record.actions_per_second for record in records)
         shown: Any = {
             **{name: mean(name) for name in ("grasp_success", "critic_loss", "actor_loss")},
@@ -336,10 +333,8 @@ class _GroupTraining:
 
 
 def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
-    """Returns grasp success of every run, by its log, and its interquartile mean over the seeds.
-
-    A run with another number of steps than the plan's does not count.
-    """
+    """Returns grasp success of every run, by its log, and its interquartile mean over the seeds. A
+    run with another number of steps than the plan's does not count."""
     points: list[dict[str, Any]] = []
     for point in plan.points:
         rows = [_row(folder, run) for run in runs_of(plan._replace(points=[point]))]

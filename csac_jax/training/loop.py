@@ -41,7 +41,7 @@ class Reporter(Protocol):
         """Shows a line about an event."""
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Shows a chunk. `eta` is the time the rest will take, s, None where unknown."""
+        """Shows a chunk; `eta` is the remaining time, s, if known."""
 
 
 class LoopState(NamedTuple):
@@ -141,10 +141,8 @@ def _train(
     stopped = f"stopped and saved at step {step}; continue with: csac-jax train --resume {run_dir}"
     done = f"done: {step * scenes} actions; saved in {run_dir}"
     reporter.log(done if stop.signal is None else stopped)
-    actions, grasps = step * scenes, loop_state.grasps
-    return Summary(
-        step, actions, loop_state.seconds, compile_seconds, mean(grasps), len(grasps), stop.signal
-    )
+    took, grasps = (loop_state.seconds, compile_seconds), loop_state.grasps
+    return Summary(step, step * scenes, *took, mean(grasps), len(grasps), stop.signal)
 
 
 def _begin(
@@ -175,11 +173,9 @@ def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
     """Raises SettingsError if the run has other settings, CheckpointError if there is no run."""
     stored = checkpoint.load_config(run_dir, at)
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
-    if names := configs.differences(longer, cfg):
-        raise SettingsError(
-            f"{run_dir} was trained with other values of {', '.join(names)}; leave them out, or "
-            "begin a new run; only train.actions may grow"
-        )
+    if names := ", ".join(configs.differences(longer, cfg)):
+        remedy = "leave them out, or begin a new run; only train.actions may grow"
+        raise SettingsError(f"{run_dir} was trained with other values of {names}; {remedy}")
 
 
 def compile_program(
@@ -225,10 +221,8 @@ def _physics_warning(cfg: Config, record: Record) -> str | None:
     diverged, actions = record.physics_diverged, cfg.train.chunk * cfg.train.scenes
     if diverged <= max(DIVERGED_SHARE * actions, 1.0):
         return None
-    return (
-        f"physics failed in {diverged} of the last {actions} actions, whose scenes were dropped; "
-        f"before you trust this run, try another sim.physics than {cfg.sim.physics}"
-    )
+    fault = f"physics failed in {diverged} of the last {actions} actions, whose scenes were dropped"
+    return f"{fault}; before you trust this run, try another sim.physics than {cfg.sim.physics}"
 
 
 def record_chunk(

@@ -11,12 +11,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax.agent import actor_critic
-from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
 from csac_jax.config import Config
 from csac_jax.replay import ring, samplers
-from csac_jax.replay.ring import ReplayState
 from csac_jax.runtime import compiler
 from csac_jax.training import programs, step
 from csac_jax.training.step import Program
@@ -29,7 +27,7 @@ class OfflineState:
     key: jax.Array  # [] typed key, root of all randomness, never consumed
     step: jax.Array  # [] int32, steps done, each of `learn.updates_per_step` updates
     learner: Any
-    replay: ReplayState
+    replay: ring.ReplayState
 
 
 @functools.lru_cache(maxsize=2)
@@ -40,13 +38,13 @@ def make(cfg: Config) -> Program:
     return Program(cfg, no_env, learner, samplers.make(cfg.replay))
 
 
-def init(program: Program, params: Params) -> Any:
+def init(program: Program, params: actor_critic.Params) -> Any:
     """Creates the learner's initial state with copies of these networks; the state is donated."""
     fresh = jax.jit(program.learner.init)(jax.random.key(0))
     return actor_critic.with_params(fresh, jax.tree.map(jnp.array, params))
 
 
-def fill(program: Program, transitions: Transition) -> ReplayState:
+def fill(program: Program, transitions: Transition) -> ring.ReplayState:
     """Creates a ring that these transitions, leaves [n, ...], fill."""
     num = transitions.reward.shape[0]
     empty = ring.init(program.sampler.init(num), programs.example(program.cfg))

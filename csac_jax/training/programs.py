@@ -14,9 +14,7 @@ from csac_jax.agent import actor_critic
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.config import Config
-from csac_jax.env import Env
 from csac_jax.replay import ring, samplers
-from csac_jax.replay.samplers import Sampler
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
 from csac_jax.sim import physics as simulation
@@ -24,7 +22,6 @@ from csac_jax.training import step
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision import heightmap
-from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
 
 
@@ -37,9 +34,9 @@ class Hyperparams(NamedTuple):
 
 def make(
     cfg: Config,
-    env: Env | None = None,
+    env: environment.Env | None = None,
     learner: Learner | None = None,
-    sampler: Sampler | None = None,
+    sampler: samplers.Sampler | None = None,
     network: Any = None,
 ) -> Program:
     """Makes the program of a config; parts that are given replace the config's."""
@@ -50,7 +47,7 @@ def make(
 
 
 def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Program:
-    """Replaces settings of a program of CSAC by values that may be traced; None changes nothing."""
+    """Replaces settings of a program of CSAC by values that may be traced."""
     if hyperparams is None:
         return program
     cfg = replace_settings(program.cfg, hyperparams.values)
@@ -109,14 +106,13 @@ def example(cfg: Config) -> Transition:
     """Returns the shapes and dtypes of a stored transition, without arrays."""
 
     def build() -> Transition:
-        rows = (cfg.heightmap.size, cfg.heightmap.size)
-        colour, target = jnp.zeros((*rows, 3)), jnp.zeros(rows, bool)
+        rows, no = (cfg.heightmap.size, cfg.heightmap.size), jnp.zeros((), bool)
         fingers = jnp.zeros(3) if cfg.net.gripper else None
-        obs = Observation(colour, jnp.zeros(rows), target, fingers)
+        maps = jnp.zeros((*rows, 3)), jnp.zeros(rows), jnp.zeros(rows, bool)
+        obs = heightmap.pack(heightmap.Observation(*maps, fingers))
+        label = no if cfg.reward.relabels else None
         action = Action(primitive=jnp.int32(0), pose=jnp.zeros(3))
-        packed = heightmap.pack(obs)
-        label = jnp.zeros((), bool) if cfg.reward.relabels else None
-        return Transition(packed, action, jnp.zeros(()), packed, jnp.zeros((), bool), label)
+        return Transition(obs, action, jnp.zeros(()), obs, no, label)
 
     return jax.eval_shape(build)
 
@@ -125,7 +121,7 @@ def abstract_state(cfg: Config, learner: Learner | None = None, network: Any = N
     """Returns the shapes and dtypes of a run's state; nothing is settled or compiled."""
     no_physics: Any = None
     blank = jax.tree.map(lambda leaf: np.asarray(leaf)[None], scene_state.parked(cfg.scene.slots))
-    program = make(cfg, Env(cfg, no_physics, blank), learner, network=network)
+    program = make(cfg, environment.Env(cfg, no_physics, blank), learner, network=network)
     return jax.eval_shape(lambda: init(program))
 
 

@@ -16,7 +16,6 @@ from csac_jax.agent import augment
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.config import Config
-from csac_jax.env import Env
 from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 from csac_jax.replay.samplers import Sampler
@@ -41,17 +40,15 @@ class Program:
     """The static parts of a run, closed over by what is compiled."""
 
     cfg: Config
-    env: Env
+    env: environment.Env
     learner: Learner
     sampler: Sampler
     mesh: Mesh | None = None  # whose devices divide scenes and batches
 
 
 def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
-    """Takes one action in each of the E scenes and makes the updates that belong to it.
-
-    On a CPU each half is a program of its own, see `split_step`; elsewhere both are one.
-    """
+    """Takes one action in each of the E scenes and makes the updates that belong to it. On a CPU
+    each half is a program of its own, see `split_step`; elsewhere both are one."""
     acted, metrics = act_half(program, state)
     # ---- acting ends, learning begins
     return learn_half(program, acted, metrics)

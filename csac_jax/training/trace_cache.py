@@ -20,7 +20,7 @@ import jax
 from jax import export
 
 import csac_jax
-from csac_jax.runtime import compiler, host_call, private_jax, provenance
+from csac_jax.runtime import compiler, host_call, provenance
 from csac_jax.training.step import Program
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.world import object_slots
@@ -31,9 +31,7 @@ _UNTRACED = re.compile("cache|logging")  # in names of JAX's settings that chang
 
 def jit(program: Program, half: Callable[..., Any], cached: bool) -> Any:
     """Returns a jitted half of `step.train_step`, or what has `lower` alone if it can be `cached`.
-
-    The state is donated. A cached program has no custom parts.
-    """
+    The state is donated. A cached program has no custom parts."""
     bound = functools.partial(half, program)
     one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
     if cached and one_cpu and program.cfg.sim.physics in ("c", "mjx") and (folder := _folder()):
@@ -105,7 +103,7 @@ def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
         (env.any_yaw, env.max_failures),
         object_slots.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
         sorted(provenance.versions().items()),
-        sorted(item for item in private_jax.settings().items() if not _UNTRACED.search(item[0])),
+        sorted(item for item in jax.config.values.items() if not _UNTRACED.search(item[0])),
         compiler.options(cfg),
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
         str(tree),

@@ -1,6 +1,7 @@
 """Transitions for the replay, and the metrics of a step. E = scenes."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,6 @@ from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
 from csac_jax.vision import heightmap
-from csac_jax.vision.heightmap import Observation
 
 
 class StepMetrics(NamedTuple):
@@ -65,22 +65,21 @@ def remember(
     return Transition(obs, action, reward, next_packed, terminated, label), push_better
 
 
-def _episodic(after: environment.State, _: environment.State) -> tuple[Observation, jax.Array]:
-    return after.obs, after.terminated
-
-
 def _continuing(
     after: environment.State, scenes_next: environment.State
-) -> tuple[Observation, jax.Array]:
+) -> tuple[heightmap.Observation, jax.Array]:
     """Returns the next scene after the last action of an episode, nothing after one without effect,
     as Zeng et al., code: `get_label_value`. Deviation: an episode cut off continues in its own."""
     effect = (after.info.moved > CHANGE_AREA) | (after.info.outcome == Outcome.LIFTED)
     return where(after.terminated, scenes_next.obs, after.obs), ~effect
 
 
-BOOTSTRAPS = {"episodic": _episodic, "continuing": _continuing}
+BOOTSTRAPS: dict[str, Callable] = {
+    "episodic": lambda after, _: (after.obs, after.terminated),
+    "continuing": _continuing,
+}
 """States after actions and those acted in next, leaves [E, ...] -> what a transition is followed
-by, leaves [E, ...], and whether V of it is 0, [E] bool."""
+by, leaves [E, ...], and if V of it is 0, [E] bool."""
 
 
 def where(condition: jax.Array, yes: Any, no: Any) -> Any:
@@ -96,7 +95,7 @@ def with_reward_outcome(cfg: RewardConfig, after: environment.State) -> environm
 
 
 def to_action_result(action: Action, info: environment.Info) -> ActionResult:
-    """Returns what a reward is computed from, leaves [...]; phi is 0, the learner fills it in."""
+    """Returns what rewards are computed from, leaves [...]; the learner fills in phi."""
     phi, changed = jnp.zeros_like(info.distance), info.moved > CHANGE_AREA
     return ActionResult(
         action.primitive, info.outcome, info.distance, phi, phi, changed, info.blocks_lost

@@ -91,7 +91,7 @@ def main(arguments: list[str]) -> None:
             sharding.check(
                 sharding.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch
             )
-            most = runner.SweepPlan(max(options.seeds), [grid.SweepPoint(grid.BASE, {}, cfg)])
+            most = runner.SweepPlan(max(options.seeds), [grid.SweepPoint("base", {}, cfg)])
             runner.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise BadArgumentsError(f"bench sweep: {error}") from None

@@ -14,7 +14,7 @@ from flax import struct
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.evaluation import monitor, policies
+from csac_jax.evaluation import monitor
 from csac_jax.evaluation.monitor import EvalPlan, Monitor
 from csac_jax.io import checkpoint
 from csac_jax.io.checkpoint import CheckpointError
@@ -80,7 +80,6 @@ def scores(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
     given: list[Any] = []
     monkeypatch.setattr(monitor.suites, "prepare", lambda *_, **__: None)
     monkeypatch.setattr(monitor.rollout, "evaluate", lambda *_: given.pop(0))
-    monkeypatch.setattr(policies, "policy_from_state", lambda cfg, state, *_: state)
     yield given
     assert given == []
 
@@ -108,7 +107,9 @@ def _run(
     cfg: Config = CFG,
 ) -> Summary:
     """A run of the tiny program, evaluated if `every`."""
-    watched = [Monitor(cfg, EvalPlan(every), notes, notes.log)] if every else []
+    watched = (
+        [Monitor(cfg, EvalPlan(every), lambda state: state, notes, notes.log)] if every else []
+    )
     joined = callbacks.joined([notes, *watched, *others])
     return loop.run(cfg, folder, _first, _chunk, notes, notes.stop, resume, callback=joined)
 

@@ -64,7 +64,7 @@ def test_learned_acts_like_the_agent(learned, states):
         return best(keys, parts, dense_maps, states.steps_without_change)
 
     expected = wanted(learned.params, states, _keys())
-    batch = jax.jit(policies.act)(learned, states, _keys())
+    batch = jax.jit(NetworkPolicy.batched)(learned, states, _keys())
     jax.tree.map(np.testing.assert_array_equal, batch, expected)
     assert batch.primitive.tolist() == [Primitive.GRASP, Primitive.PUSH, Primitive.GRASP]
     for number in range(SCENES):

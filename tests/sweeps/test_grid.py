@@ -95,8 +95,8 @@ def test_long_names_give_way_to_numbers():
         (["learn.tau=0.1", "learn.tau=0.2"], "a setting is given twice"),
         (["learn.actor=yes"], "neither true nor false"),
         (["algo=a/b"], "slash"),
-        (["algo=.."], "begin with a dot"),
-        (["algo=--seed"], "begin with a dot or dash"),
+        (["algo=.."], "begins with no dot"),
+        (["algo=--seed"], "begins with no dot or dash"),
     ],
 )
 def test_bad_input(varied: list[str], message: str):
