@@ -23,21 +23,18 @@ def test_operations_are_those_of_the_net():
     assert abs(ours / counted - 1.0) < 0.03, (ours, counted)
 
 
-@pytest.mark.parametrize(
-    ("kernel", "kind"),
-    [
-        ("_JTDACJ_sparse__locals__kernel_f7a9e7d7_cuda_kernel_forward", "physics"),
-        ("sm80_xmma_fprop_implicit_gemm_bf16", "products"),
-        ("input_concatenate_fusion_7", "moves"),
-        ("input_reduce_select_fusion_4", "reductions"),
-        ("ncclDevKernel_AllReduce_Sum_f32_RING_LL", "exchanges"),
-        ("sort_23_1", "sorts"),
-        ("loop_add_fusion_46", "other"),
-    ],
-)
-def test_kernels_by_name(kernel: str, kind: str):
+def test_kernels_by_name():
     """Claim: the names that XLA, cuDNN, NCCL and Warp give tell what a kernel does."""
-    assert step_kernels.kind(kernel) == kind
+    kinds = {
+        "_JTDACJ_sparse__locals__kernel_f7a9e7d7_cuda_kernel_forward": "physics",
+        "sm80_xmma_fprop_implicit_gemm_bf16": "products",
+        "input_concatenate_fusion_7": "moves",
+        "input_reduce_select_fusion_4": "reductions",
+        "ncclDevKernel_AllReduce_Sum_f32_RING_LL": "exchanges",
+        "sort_23_1": "sorts",
+        "loop_add_fusion_46": "other",
+    }
+    assert {name: step_kernels.kind(name) for name in kinds} == kinds
 
 
 def test_time_in_which_kernels_run():
@@ -52,11 +49,8 @@ def test_time_in_which_kernels_run():
 
 def test_page_shows_figures_and_failures():
     """Claim: the page of `make bench` has the main figures of a result, or why there is none."""
-    result = {
-        "rows": [{"actions_per_second": 1.25}, {"actions_per_second": 3.0}],
-        "wall_seconds": 2,
-    }
-    shown = [row["value"] for row in page.rows("sweep", result)]
+    rates = [{"actions_per_second": rate} for rate in (1.25, 3.0)]
+    shown = [row["value"] for row in page.rows("sweep", {"rows": rates, "wall_seconds": 2})]
     assert shown == ["1.25", "3", "2"]
     (row,) = page.rows("sweep", {"failed": "no room", "wall_seconds": 2})
     assert row == {"benchmark": "sweep", "figure": "failed", "value": "no room"}

@@ -1,6 +1,6 @@
 """Every file of examples/ runs, and is short."""
 
-import importlib.util
+import importlib
 from pathlib import Path
 from types import ModuleType
 
@@ -18,12 +18,7 @@ pytestmark = [pytest.mark.mjx, pytest.mark.optax]
 
 
 def _module(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(f"examples.{name}")
 
 
 def test_examples_are_short_and_tested():

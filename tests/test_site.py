@@ -18,6 +18,7 @@ from csac_jax.training.loop import Record
 pytest.importorskip("mkdocs")
 ROOT = Path(csac_jax.__file__).parents[1]
 LOADED = {"script": "src", "img": "src", "iframe": "src", "source": "src", "video": "src"}
+ELSEWHERE = re.compile(r"(https?:)?//")
 LINKED = ("stylesheet", "preload", "preconnect", "icon", "manifest", "prefetch", "modulepreload")
 
 
@@ -40,20 +41,17 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class _Loads(HTMLParser):
     """The addresses that a page loads as it opens, without links that a reader may follow."""
 
-    def __init__(self) -> None:
+    def __init__(self, text: str) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list) -> None:
         values = dict(attrs)
         if tag in LOADED and LOADED[tag] in values:
-            self.found.append(values[LOADED[tag]])
+            self.addresses.append(values[LOADED[tag]])
         if tag == "link" and set((values.get("rel") or "").split()) & set(LINKED):
-            self.found.append(values["href"])
-
-
-def _is_elsewhere(target: str) -> bool:
-    return re.match(r"(https?:)?//", target) is not None
+            self.addresses.append(values["href"])
 
 
 def test_nothing_is_loaded_from_elsewhere(site: Path):
@@ -62,16 +60,15 @@ def test_nothing_is_loaded_from_elsewhere(site: Path):
     pages = list(site.rglob("*.html"))
     assert len(pages) > 30
     for page in pages:
-        loads = _Loads()
-        loads.feed(page.read_text())
-        assert len(loads.found) > 3
-        assert not [target for target in loads.found if _is_elsewhere(target)], page
-        paths = [target.split("?")[0].split("#")[0] for target in loads.found]
+        addresses = _Loads(page.read_text()).addresses
+        assert len(addresses) > 3
+        assert not list(filter(ELSEWHERE.match, addresses)), page
+        paths = [re.split(r"[?#]", address)[0] for address in addresses]
         for path in paths if page.name != "404.html" else ():
             assert path.startswith("data:") or (page.parent / path).exists(), (page, path)
     for style in site.rglob("*.css"):
         urls = re.findall(r"""(?:@import\s+|url\()\s*["']?([^"')\s]+)""", style.read_text())
-        assert not list(filter(_is_elsewhere, urls)), style
+        assert not list(filter(ELSEWHERE.match, urls)), style
 
 
 def test_references_are_complete(site: Path):

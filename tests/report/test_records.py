@@ -4,7 +4,6 @@ import fnmatch
 import json
 import re
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +65,7 @@ def test_verdicts_by_hand():
 @pytest.mark.parametrize("path", ARCHIVES, ids=lambda path: path.stem)
 def test_archives_say_what_they_hold(path: Path):
     """Claim: an archive names each of its folders and nothing else, holds no path of a machine and
-    no damaged record, and its configs load."""
+    no damaged record, and its configs load, but those of a network of an earlier version."""
     contents = index.contents(path)
     folders = {name.split("/seed-")[0] for name in contents if "/seed-" in name}
     about = json.loads(contents[index.ABOUT])
@@ -74,8 +73,9 @@ def test_archives_say_what_they_hold(path: Path):
     assert all(any(name.startswith(key) for name in contents) for key in about if key != ".")
     text = b"\n".join(contents.values())
     assert not re.search(rb'"(?:/|~/|[A-Z]:\\)|"host', text)
-    for config in {content for name, content in contents.items() if name.endswith("config.json")}:
-        configs.from_dict(json.loads(config))
+    for text in {content for name, content in contents.items() if name.endswith("config.json")}:
+        if (config := json.loads(text))["net"]["kind"] != "offset":
+            configs.from_dict(config)
 
 
 def test_benchmarks_and_configs_are_records():
@@ -118,15 +118,28 @@ def test_figures_and_pictures_are_linked_and_small():
     assert all(path.stat().st_size < 4e5 for path in figures.FIGURES.iterdir())
 
 
-def _links() -> Iterator[tuple[Path, str]]:
-    for page in PAGES:
-        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
-            if not target.startswith("http"):
-                yield page, target
-
-
 def test_links_lead_somewhere():
     """Claim: README and docs link to files that exist."""
-    links = list(_links())
-    assert len(links) > 50
-    assert not [link for link in links if not (link[0].parent / link[1]).exists()]
+    links = [(page, to) for page in PAGES for to in re.findall(r"\]\(([^)#\s]+)", page.read_text())]
+    local = [(page, target) for page, target in links if not target.startswith("http")]
+    assert len(local) > 50
+    assert not [link for link in local if not (link[0].parent / link[1]).exists()]
+
+
+def test_records_that_pages_name_exist():
+    """Claim: each benchmark's record that README and docs name, as `bench/act.json`, `cpu`, is
+    there; so is each folder of runs, as `fast/csac_beta`."""
+    text = "\n".join(page.read_text() for page in PAGES)
+    pattern = r"`(bench/\w+\.json)`(?:, `([\w*/.-]+)`)?(?: and `([\w-]+)`)?"
+    benchmarks = re.findall(pattern, text)
+    assert len(benchmarks) > 40
+    for path, *names in benchmarks:
+        records = json.loads((index.RESULTS / path).read_text())
+        assert all(fnmatch.filter(records, name) for name in names if name), (path, names)
+    families = [path for path in ARCHIVES if path.parent == index.RESULTS]
+    runs = [name for path in families for name in index.contents(path)]
+    named = re.findall(
+        r"`((?:fast|grippers|objects|paper|quick)/[\w*/-]+)`", re.sub(pattern, "", text)
+    )
+    assert len(named) > 20
+    assert not [name for name in named if not fnmatch.filter(runs, f"{name}*")]
