@@ -69,7 +69,7 @@ def _decide(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
     if not decisions:
         print("nothing to act on")
     if options.png is not None:
-        view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
+        view, maps = images.make(*image, mask), policy.maps(*image, mask)
         drawing = decision_picture.picture(policy.cfg, view, decisions, maps)
         media.write_picture(options.png, drawing)
     result: dict[str, Any] = {"decisions": [action.to_dict() for action in decisions]}
