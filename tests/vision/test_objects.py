@@ -123,7 +123,7 @@ def test_windows_are_smaller_than_the_view():
 def test_observation_needs_no_mujoco():
     """Claim: objects are seen without MuJoCo."""
     code = (
-        "import sys; from csac_jax.vision import observe; from csac_jax.world import object_slots;"
+        "import sys; from csac_jax.vision import observe; from csac_jax.scene import stock;"
         "assert 'mujoco' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
