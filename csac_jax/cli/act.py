@@ -57,7 +57,7 @@ def run(arguments: list[str]) -> int:
     return (_check if options.check else _decide)(options, policy, image)
 
 
-def _decide(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
+def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) -> int:
     from csac_jax.deploy import image_files, images
     from csac_jax.render import decision_picture, media
 
@@ -69,7 +69,7 @@ def _decide(options: ActOptions, policy: Any, image: tuple[Any, ...]) -> int:
     if not decisions:
         print("nothing to act on")
     if options.png is not None:
-        view, maps = images.make(*image, target_mask=mask), policy.maps(*image, mask)
+        view, maps = images.make(*image, mask), policy.maps(*image, mask)
         drawing = decision_picture.picture(policy.cfg, view, decisions, maps)
         media.write_picture(options.png, drawing)
     result: dict[str, Any] = {"decisions": [action.to_dict() for action in decisions]}
