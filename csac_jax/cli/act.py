@@ -57,7 +57,7 @@ def run(arguments: list[str]) -> int:
     return (_check if options.check else _decide)(options, policy, image)
 
 
-def _decide(options: ActOptions, policy: Any, image: Any) -> int:
+def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) -> int:
     from csac_jax.deploy import image_files, images
     from csac_jax.render import decision_picture, media
 
