@@ -164,7 +164,7 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
     if physics == "mjx":
         from csac_jax.sim import mjx_physics
 
-        found = vars(mjx_physics.scene_model(mjx_physics.make(world, sim), scene))
+        found = vars(mjx_physics.scene_model(mjx_physics.MjxPhysics(world, sim), scene))
     else:
         from csac_jax.sim import warp_physics
 

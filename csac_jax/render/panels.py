@@ -51,7 +51,8 @@ def figure(cfg: Config, step: StepRecord, height: int) -> Figure:
     fig = heatmaps.figure(1.1 * height, height, height)
     q_axes, (heights, legend) = fig.subplots(2, 2, sharex=True, sharey=True, gridspec_kw=LEARNED)
     heatmaps.draw_q_maps(cfg, q_axes, step.debug.q)
-    _draw_action(cfg, q_axes[int(step.action.primitive)], step)
+    kind = int(step.action.primitive)
+    heatmaps.draw_action(cfg, q_axes[kind], kind, step.action.pose)
     _draw_height_map(cfg, heights, step)
     handles, _ = heights.get_legend_handles_labels()
     handles.append(Patch(color=heatmaps.INVALID, label="nothing to act on"))
@@ -67,8 +68,4 @@ def _draw_height_map(cfg: Config, axes: Axes, step: StepRecord) -> None:
         for primitive, colour in CANDIDATES.items():
             x, y, _ = 1e3 * np.asarray(step.debug.candidates)[primitive].T
             axes.scatter(x, y, 14.0, colour, label=f"{primitive.name.lower()} candidates", **style)
-    _draw_action(cfg, axes, step)
-
-
-def _draw_action(cfg: Config, axes: Axes, step: StepRecord) -> None:
     heatmaps.draw_action(cfg, axes, int(step.action.primitive), step.action.pose)

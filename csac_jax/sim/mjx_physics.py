@@ -1,6 +1,5 @@
 """Primitives in MJX: a fixed-length scan of physics steps per scene; callers vmap."""
 
-import dataclasses
 import functools
 
 import jax
@@ -18,14 +17,17 @@ from csac_jax.world.model import World, scene_fields
 from csac_jax.world.scene_state import SceneState
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MjxPhysics:
     """A world on the device, which the compiled step closes over."""
 
-    world: World
-    cfg: SimConfig
-    model: mjx.Model
-    data: mjx.Data  # blank state whose arrays fix shapes and dtypes
+    def __init__(self, world: World, cfg: SimConfig) -> None:
+        """Raises SceneError for MJCF that MJX lacks code for."""
+        self.world, self.cfg = world, cfg
+        try:
+            self.model = mjx.put_model(world.model, impl="jax")
+        except NotImplementedError as error:
+            raise SceneError(f"MJX cannot run the MJCF: {error}; take sim.physics c") from None
+        self.data = mjx.make_data(world.model, impl="jax")  # blank, fixes shapes and dtypes
 
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Runs one primitive; matrix products keep float32, which a GPU would cut to 10 bits."""
@@ -44,15 +46,6 @@ class MjxPhysics:
             data, substeps = jax.lax.scan(substep, initial, joints.control)
         moved = model_fields.moved(world, scene, data.qpos, data.qvel)
         return scene_state.park(moved, scene.in_play), outcome.trace_of(self.cfg, substeps)
-
-
-def make(world: World, cfg: SimConfig) -> MjxPhysics:
-    """Builds the physics of a world. Raises SceneError for MJCF that MJX lacks code for."""
-    try:
-        mjx_model = mjx.put_model(world.model, impl="jax")
-    except NotImplementedError as error:
-        raise SceneError(f"MJX cannot run the MJCF: {error}; take sim.physics c") from None
-    return MjxPhysics(world, cfg, mjx_model, mjx.make_data(world.model, impl="jax"))
 
 
 def scene_model(physics: MjxPhysics, scene: SceneState) -> mjx.Model:

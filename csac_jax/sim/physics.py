@@ -27,7 +27,7 @@ class Physics(Protocol):
 def _make_mjx(world: World, cfg: SimConfig) -> Physics:
     from csac_jax.sim import mjx_physics  # MJX imports slower than the rest of the package
 
-    return mjx_physics.make(world, cfg)
+    return mjx_physics.MjxPhysics(world, cfg)
 
 
 PHYSICS: dict[str, Callable[[World, SimConfig], Physics]] = {

@@ -106,7 +106,6 @@ def _is_red(image: np.ndarray) -> np.ndarray:
     [
         ("--scene nowhere", 2, "--scene: 'nowhere' is neither a case file nor one of: random"),
         ("--size 95 64", 2, "--size: both numbers must be even"),
-        ("--seed -1", 2, "--seed: must lie in"),
         ("--policy nowhere", 1, "there is no folder nowhere"),
         ("--png a.txt", 2, "a.txt: its name must end in"),
         ("--video a.png", 2, "a.png: its name must end in"),

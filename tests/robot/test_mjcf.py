@@ -143,7 +143,7 @@ def test_mjcf_that_mjx_cannot_run_is_one_line(tmp_path: Path, old: str, new: str
     folder = _changed(tmp_path / "mine", "rg2", (old, new))
     sim = SimConfig(gripper=folder, physics="mjx")
     with pytest.raises(SceneError, match=f"MJX .*{says}.*; .*take sim.physics c") as error:
-        mjx_physics.make(model.build(SCENE, sim), sim)
+        mjx_physics.MjxPhysics(model.build(SCENE, sim), sim)
     assert "\n" not in str(error.value)
     _built(folder)
 

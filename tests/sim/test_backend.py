@@ -11,7 +11,7 @@ import pytest
 
 from csac_jax import grippers, presets
 from csac_jax.config import Config, PhysicsKind, RobotKind, SceneConfig
-from csac_jax.robot import kinematics, primitives
+from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import backend, physics
 from csac_jax.world import model
@@ -68,17 +68,13 @@ def test_choice_for_objects(monkeypatch: pytest.MonkeyPatch, platform, scenes, c
 
 
 def test_other_choices_stay():
-    """Claim: what the user has chosen stays; `auto` that nobody resolved is refused by its name."""
-    for kind in ("mjx", "warp", "c"):
+    """Claim: what the user has chosen stays; `auto` that nobody resolved is refused by its name;
+    every physics of the config has its entry."""
+    assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
+    for kind in physics.PHYSICS:
         assert backend.resolve(_config(kind)) == _config(kind)
     with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* one of: mjx, warp, c"):
         physics.make(None, _config("auto").sim)
-
-
-def test_tables_are_those_of_the_config():
-    """Claim: every physics and arm of the config has its entry, and there are no others."""
-    assert {*physics.PHYSICS, "auto"} == {*typing.get_args(PhysicsKind)}
-    assert {*kinematics.ARMS, "hand"} == {*typing.get_args(RobotKind)}
 
 
 @pytest.mark.parametrize("gripper", grippers.shipped())

@@ -30,7 +30,7 @@ def test_products_keep_their_precision(world):
     config = conftest.CONFIG
     scene = jax.tree.map(jnp.asarray, scene_state.parked(config.scene.slots))
     height = jnp.zeros((config.heightmap.size,) * 2)
-    engine = mjx_physics.make(world, config.sim)
+    engine = mjx_physics.MjxPhysics(world, config.sim)
 
     def act(scene, height):
         action = oracle.grasp(config, scene, height)
@@ -77,7 +77,7 @@ def test_meshes_are_as_large_as_the_blocks(scale: float):
     world = model.build(config.scene, config.sim)
     scene = scene_state.parked(config.scene.slots)
     scene = scene.replace(half_size=scene.half_size * np.float32(scale))
-    scaled = mjx_physics.scene_model(mjx_physics.make(world, config.sim), scene)
+    scaled = mjx_physics.scene_model(mjx_physics.MjxPhysics(world, config.sim), scene)
     for slot, geom in enumerate(world.block_geoms):
         mesh = scaled._impl.mesh_convex[world.model.geom_dataid[geom]]
         turn = Rotation.from_quat(world.model.geom_quat[geom], scalar_first=True)
@@ -102,7 +102,7 @@ def test_all_that_follows_from_blocks_is_the_scenes():
         density=rng.uniform(450.0, 900.0, len(slots)).astype(np.float32),
         friction=rng.uniform(0.5, 1.0, len(slots)).astype(np.float32),
     )
-    ours = mjx_physics.scene_model(mjx_physics.make(world, config.sim), scene)
+    ours = mjx_physics.scene_model(mjx_physics.MjxPhysics(world, config.sim), scene)
     exact = model.with_blocks(world, jax.device_get(model.scene_fields(world, scene)))
     changed = set()
     for field in dataclasses.fields(ours):

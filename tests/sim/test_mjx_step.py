@@ -78,7 +78,7 @@ def world() -> model.World:
 
 @pytest.fixture(scope="module")
 def ours(world: model.World) -> Ends:
-    physics = mjx_physics.make(world, CONFIG.sim)
+    physics = mjx_physics.MjxPhysics(world, CONFIG.sim)
 
     def one(qpos: jax.Array, ctrl: jax.Array) -> mjx.Data:
         its = mjx_physics.scene_model(physics, SCENE)

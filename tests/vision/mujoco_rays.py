@@ -41,10 +41,11 @@ def nominal_meshes() -> Iterator[None]:
 
 
 def placed(world: models.World, scene: scene_state.SceneState) -> Placed:
-    """A scene of a world that was built by `nominal_meshes`, the hand high above."""
+    """A scene of a world that was built by `nominal_meshes`; hand high above, table endless."""
     with nominal_meshes():
         fields = jax.device_get(models.scene_fields(world, scene))
     model = models.with_blocks(world, fields)
+    model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0
     data = mujoco.MjData(model)
     data.qpos[world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
     data.qpos[world.robot_qpos[2]] = 3.0
