@@ -75,6 +75,6 @@ class Learner(abc.ABC):
     ) -> tuple[jax.Array, jax.Array]:
         """Computes rewards [E] float32 and which pushes were good [E] bool; `result` lacks phi.
 
-        By default phi is 0: take `push_label` "change" with it.
+        By default phi is 0: take `push_label` "map_changed" with it.
         """
         return rewards.rewards_of(cfg, result)
