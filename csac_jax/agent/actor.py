@@ -1,7 +1,6 @@
-"""The actor: one pose per primitive, a soft-argmax around the highest logit, and its update.
+"""The actor: a pose per primitive by a soft-argmax around its highest logit, and its update.
 
-A soft-argmax over the whole map would lie between two peaks. Around one cell it moves smoothly with
-the logits.
+A soft-argmax over the whole map would lie between two peaks.
 """
 
 import functools
@@ -19,8 +18,8 @@ from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
 
-WINDOW = 2  # cells on each side of the highest one that the soft-argmax covers
-_INWARD = WINDOW + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towards the middle
+_WINDOW = np.arange(-2, 3)  # cells around the highest one that the soft-argmax covers
+_INWARD = 2 + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towards the middle
 
 
 def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
@@ -28,8 +27,7 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
     side, num = frames.side, frames.yaws.shape[0]
     best = maps.best_cells(state.logits[primitive], state.valid[primitive], 1)[0]
     k, row, col = jnp.unravel_index(best, (num, side, side))
-    around = np.arange(-WINDOW, WINDOW + 1)
-    rows, cols = jnp.clip(row + around, 0, side - 1), jnp.clip(col + around, 0, side - 1)
+    rows, cols = jnp.clip(row + _WINDOW, 0, side - 1), jnp.clip(col + _WINDOW, 0, side - 1)
     window = (k, rows[:, None], cols[None, :])
     valid = state.valid[primitive][window]
     valid |= ~jnp.any(valid)
@@ -68,10 +66,10 @@ def _along_yaw(
 def update(
     learner: ActorCritic, state: LearnerState, obs: Observation
 ) -> tuple[LearnerState, jax.Array]:
-    """Updates theta^mu up the critic, Algorithm 1 lines 22-23; also returns the loss [].
+    """Updates theta^mu up the critic, Algorithm 1 lines 22-23; also returns the loss [], -J.
 
     grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each
-    primitive that the policy takes; the loss is -J. Without an actor nothing changes and it is 0.
+    primitive that the policy takes. Without an actor nothing changes and the loss is 0.
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())

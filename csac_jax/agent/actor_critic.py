@@ -1,7 +1,6 @@
 """Networks and optimisers of an actor-critic: static parts, initial state and parameters.
 
-M = critics, one or two of the same shape, with stacked parameters. `values` turns networks into
-dense maps, `critic` and `actor` update them.
+M = critics, one or two of the same shape, with stacked parameters.
 """
 
 import dataclasses
@@ -85,13 +84,10 @@ def init(key: jax.Array, learner: ActorCritic) -> LearnerState:
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key_critic, jnp.arange(cfg.learn.critics))
     (_, features), critic = jax.vmap(nets.critic.init_with_output, (0, None))(keys, blank)
     online = Params(critic, nets.head.init(key_actor, features[0]))
-    return LearnerState(
-        online=online,
-        target=jax.tree.map(jnp.copy, online),
-        critic_optimiser=learner.critic_optimiser.init(networks.learned(online.critic)),
-        actor_optimiser=learner.actor_optimiser.init(networks.learned(online.actor)),
-        updates=jnp.int32(0),
-    )
+    critic_optimiser = learner.critic_optimiser.init(networks.learned(online.critic))
+    actor_optimiser = learner.actor_optimiser.init(networks.learned(online.actor))
+    target = jax.tree.map(jnp.copy, online)
+    return LearnerState(online, target, critic_optimiser, actor_optimiser, jnp.int32(0))
 
 
 def abstract_params(cfg: Config, network: Any = None) -> Params:

@@ -34,11 +34,9 @@ def apply_symmetry(
     x, y = jnp.where(swap, y, x), jnp.where(swap, x, y)
     yaw = jnp.where(swap, np.float32(0.5 * np.pi) - yaw, yaw)
     pose = jnp.stack([x, y, geometry.wrap_angle(yaw)])
-    return transition.replace(
-        obs=jax.tree.map(view, transition.obs),
-        next_obs=jax.tree.map(view, transition.next_obs),
-        action=transition.action.replace(pose=pose),
-    )
+    obs, next_obs = jax.tree.map(view, (transition.obs, transition.next_obs))
+    action = transition.action.replace(pose=pose)
+    return transition.replace(obs=obs, next_obs=next_obs, action=action)
 
 
 def random_symmetry(key: jax.Array, transition: Transition) -> Transition:
@@ -52,10 +50,9 @@ def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
     It stays unchanged where that would cut off a surface higher than BARE in either map, the place
     of the action or the end of a push; or where a push is already cut off.
     """
-    pose = transition.action.pose
+    pose, primitive = transition.action.pose, transition.action.primitive
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
     new_pose = jnp.append(pose[:2] + step, pose[2])
-    primitive = transition.action.primitive
     fits = _reaches(cfg, primitive, pose) & _reaches(cfg, primitive, new_pose)
     for obs in (transition.obs, transition.next_obs):
         fits &= _stays(cfg, heightmap.unpack(obs).height, step)
@@ -88,16 +85,13 @@ def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
     row, col = row[:, None], col[None]
     inside = (row >= 0) & (row < size) & (col >= 0) & (col < size)
     source = jnp.where(inside, row * size + col, jnp.argmin(obs.height).astype(jnp.int32))
-
-    def take(field: jax.Array) -> jax.Array:
-        return field.reshape(size * size, *field.shape[2:]).at[source].get(mode="promise_in_bounds")
-
-    return PackedObservation(
-        colour=take(obs.colour),
-        height=jnp.where(inside, take(obs.height), jnp.uint16(0)),
-        target=jnp.where(inside, take(obs.target), jnp.all(obs.target)),
-        fingers=obs.fingers,
+    colour, height, target = (
+        field.reshape(size * size, *field.shape[2:]).at[source].get(mode="promise_in_bounds")
+        for field in (obs.colour, obs.height, obs.target)
     )
+    height = jnp.where(inside, height, jnp.uint16(0))
+    target = jnp.where(inside, target, jnp.all(obs.target))
+    return PackedObservation(colour, height, target, obs.fingers)
 
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:

@@ -21,8 +21,8 @@ class CEMResult(NamedTuple):
 
 
 class _Search(NamedTuple):
-    mean: jax.Array  # [3]
-    std: jax.Array  # [3]
+    mean: jax.Array  # [3], as std
+    std: jax.Array
     best: CEMResult
 
 
@@ -55,8 +55,7 @@ def maximise(
 
 def _sample(key: jax.Array, search: _Search, i: jax.Array | int, num: int) -> jax.Array:
     """Draws Gaussian samples [num, 3] of round i."""
-    shape, dtype = (num, *search.mean.shape), search.mean.dtype
-    noise = jax.random.normal(jax.random.fold_in(key, i), shape, dtype)
+    noise = jax.random.normal(jax.random.fold_in(key, i), (num, 3), search.mean.dtype)
     return box.project(search.mean[None] + search.std[None] * noise)
 
 
@@ -64,18 +63,13 @@ def _update(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array) -
     """Updates the search with `actions` [J, 3]; unchanged if none of them has a value."""
     values = jax.vmap(score)(actions)  # [J]
     elite_values, elite = jax.lax.top_k(jnp.where(jnp.isnan(values), -jnp.inf, values), cfg.elites)
-    elites = actions[elite]  # [K, 3], best first
-    mean, std = fit(cfg, elites, elite_values > -jnp.inf)
-    any_valid = elite_values[0] > -jnp.inf
+    elites, valid = actions[elite], elite_values > -jnp.inf  # [K, 3] and [K], best first
+    mean, std = fit(cfg, elites, valid)
     better = elite_values[0] > search.best.value
-    best = CEMResult(
-        jnp.where(better, elites[0], search.best.action),
-        jnp.where(better, elite_values[0], search.best.value),
-        actions,
-    )
-    return _Search(
-        jnp.where(any_valid, mean, search.mean), jnp.where(any_valid, std, search.std), best
-    )
+    action = jnp.where(better, elites[0], search.best.action)
+    value = jnp.where(better, elite_values[0], search.best.value)
+    mean, std = jnp.where(valid[0], mean, search.mean), jnp.where(valid[0], std, search.std)
+    return _Search(mean, std, CEMResult(action, value, actions))
 
 
 def fit(cfg: CEMConfig, elites: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:

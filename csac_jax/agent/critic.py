@@ -19,15 +19,12 @@ from csac_jax.vision.heightmap import Observation
 
 
 def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
-    """Computes V(s') [] over the primitives that the policy takes, by `target.value`."""
-    return NEXT_VALUES[learner.cfg.target.value](learner, key, state)
+    """Computes V(s') [] over the primitives that the policy takes, by `target.value`.
 
-
-def _max_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
-    """Returns max Q'(s', .) [] over valid cells, eq. 9 and VPG; over all if none is valid.
-
-    The limit of the softmax over the map: a trilinear map is highest in a cell, which samples miss.
+    The maximum (eq. 9, VPG) is over valid cells; over all if none is valid.
     """
+    if learner.cfg.target.value == "softmax":
+        return _softmax_value(learner, key, state)
     chosen = np.array(maps.allowed_primitives(learner.cfg.policy))
     valid = state.valid[chosen]
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
@@ -36,8 +33,7 @@ def _max_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Ar
 def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
     """Estimates softmax_beta(Q'(s', .)) [] from noisy target actions, Algorithm 1 line 17.
 
-    Samples on empty table are ignored unless every sample is. beta is relative to the range of
-    returns (ours).
+    Samples on empty table are ignored unless all are. beta is relative to `return_range` (ours).
     """
     cfg, frames = learner.cfg.target, learner.frames
 
@@ -46,8 +42,8 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> ja
         key_noise = jax.random.fold_in(key, primitive)
         noisy, log_density = losses.noisy_actions(key_noise, cfg, mean)
         poses = jax.vmap(maps.denormalise, (None, 0))(frames, noisy)
-        read = jax.vmap(maps.read_valid, (None, None, None, 0))
-        return *read(frames, single, 0, poses), log_density
+        read = jax.vmap(maps.read_valid, (None, None, None, 0))(frames, single, 0, poses)
+        return *read, log_density
 
     samples = maps.map_primitives(sample, state, maps.allowed_primitives(learner.cfg.policy))
     q, valid, log_density = (leaf.reshape(-1) for leaf in samples)
@@ -59,15 +55,12 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> ja
     )
 
 
-NEXT_VALUES = {"softmax": _softmax_value, "max": _max_value}
-
-
 def renewed_reward(
     learner: ActorCritic, params: Params, batch: Transition, next_maps: DenseMaps
 ) -> jax.Array:
     """Returns rewards [B] with eq. 16's label of pushes by `params`, or as stored without labels.
 
-    phi(s') is read from `next_maps`, of the same networks; only pushes need phi(s).
+    phi(s') is read from `next_maps`, of the same networks.
     """
     if batch.push_better is None:
         return batch.reward
@@ -81,9 +74,9 @@ def renewed_reward(
 def q_of_actions(
     learner: ActorCritic, critic: Any, obs: Observation, action: Action
 ) -> tuple[jax.Array, Any]:
-    """Computes Q(s, a) of a batch by each critic [M, B], and the running statistics after it.
+    """Computes Q(s, a) [M, B] from two passes per state, in the frames next to the action's yaw.
 
-    From two passes per state, in the frames next to the action's yaw; nets run as in training.
+    Also returns the critics' running statistics after it.
     """
     frames, num = learner.frames, learner.frames.yaws.shape[0]
     index = maps.yaw_index(frames, action.pose[:, 2])
@@ -92,14 +85,11 @@ def q_of_actions(
     half = jnp.mod(k, num // 2)
     inputs = maps.input_maps(frames, obs)
     passes = jax.vmap(rotate.rotate, (None, 0, 0))(frames.tables, inputs, half)
-    flat = passes.reshape(-1, *passes.shape[2:])
-    (q, _), statistics = values.map_critics(
-        lambda variables: networks.train(frames.networks.critic, variables, flat), critic
-    )
+    flat, net = passes.reshape(-1, *passes.shape[2:]), frames.networks.critic
+    (q, _), statistics = values.map_critics(lambda own: networks.train(net, own, flat), critic)
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
-    push_output = (k >= num // 2).astype(jnp.int32)
     is_grasp = (action.primitive == Primitive.GRASP)[:, None]
-    output = jnp.where(is_grasp, dense.OUTPUTS - 1, push_output)
+    output = jnp.where(is_grasp, dense.OUTPUTS - 1, (k >= num // 2).astype(jnp.int32))
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
         yaw = jnp.asarray(frames.yaws)[half]
@@ -137,7 +127,6 @@ def update(
     (critic_loss, (q, statistics)), gradient = jax.value_and_grad(loss, has_aux=True)(before)
     step, optimiser = learner.critic_optimiser.update(gradient, state.critic_optimiser)
     online = state.online.replace(critic={**optax.apply_updates(before, step), **statistics})
-    updates = state.updates + 1
     target = losses.update_target(cfg.learn, online, state.target)
-    state = state.replace(online=online, target=target, critic_optimiser=optimiser, updates=updates)
+    state = LearnerState(online, target, optimiser, state.actor_optimiser, state.updates + 1)
     return state, UpdateInfo(critic_loss, jnp.mean(q), y - q)

@@ -24,8 +24,8 @@ from csac_jax.vision.heightmap import Observation
 class CSAC(Learner):
     """The learner of the algorithms in `algorithms`, by the config of `parts`.
 
-    The training step also calls `update_actor`, once after all updates of a step. Sweeps, which
-    vmap runs, ask for `replace_hyperparams` and `batched`.
+    The training step also calls `update_actor`, once after all updates of a step. Sweeps ask for
+    `replace_hyperparams` and `batched`.
     """
 
     parts: ActorCritic
@@ -44,13 +44,11 @@ class CSAC(Learner):
     ) -> Action:
         """Chooses by CEM on the critic's maps from the actor's mean, plus noise (lines 8-13)."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(steps_without_change)))
+        look = functools.partial(values.decision_maps, explores=actions_taken is not None)
+        inputs = keys, self.parts, self._chunked(look)(state.online, obs), steps_without_change
         if actions_taken is None:
-            maps = self._chunked(values.decision_maps)(state.online, obs)
-            best = jax.vmap(policy.best_action, (0, None, 0, 0))
-            return best(keys, self.parts, maps, steps_without_change)
-        maps = self._chunked(values.exploration_maps)(state.online, obs)
-        act = jax.vmap(policy.act, (0, None, 0, 0, None))
-        return act(keys, self.parts, maps, steps_without_change, actions_taken)
+            return jax.vmap(policy.best_action, (0, None, 0, 0))(*inputs)
+        return jax.vmap(policy.act, (0, None, 0, 0, None))(*inputs, actions_taken)
 
     def reward(
         self,

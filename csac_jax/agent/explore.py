@@ -35,8 +35,7 @@ def choose(
     """Chooses a primitive [] int32 and a normalised pose [3], after `actions_taken` [].
 
     With a decaying probability the primitive is random, a push with `push_fraction` (VPG). With
-    another one the pose is that primitive's of `places` [P, 3], which are random. Otherwise it is
-    the primitive's greedy pose plus noise: a random primitive still acts where it is best.
+    another one the pose is that of random `places` [P, 3], else the primitive's greedy one + noise.
     """
     key_explore, key_push, key_place, key_noise = jax.random.split(key, 4)
     epsilon = probability(*cfg.epsilon_primitive, cfg.epsilon_decay, actions_taken)

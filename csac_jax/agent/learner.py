@@ -1,7 +1,6 @@
 """The interface between a training step and what learns from replayed transitions.
 
-A learner of your own derives from `Learner`: `init`, `act`, `update` and, at will, `reward`.
-`csac.CSAC` is the one that the package comes with.
+A custom learner derives from `Learner`: `init`, `act`, `update` and, at will, `reward`.
 """
 
 import abc
@@ -53,10 +52,9 @@ class Learner(abc.ABC):
         steps_without_change: jax.Array,
         actions_taken: jax.Array | None = None,
     ) -> Action:
-        """Chooses an action for every observation, leaves [E, ...].
+        """Chooses an action for every observation, leaves [E, ...]; steps_without_change [E] int32.
 
-        Args: steps_without_change [E] int32; actions_taken [] int32 by the whole run, which
-        exploration decays with, or None for the policy without exploration.
+        Exploration decays with `actions_taken` [] int32, of the whole run; None: no exploration.
         """
 
     @abc.abstractmethod
@@ -75,6 +73,6 @@ class Learner(abc.ABC):
     ) -> tuple[jax.Array, jax.Array]:
         """Computes rewards [E] float32 and which pushes were good [E] bool; `result` lacks phi.
 
-        By default phi is 0: take `push_label` "change" with it.
+        By default phi is 0: take `push_label` "map_changed" with it.
         """
         return rewards.rewards_of(cfg, result)

@@ -1,11 +1,5 @@
-"""The critic's target from the softmax value of the next state, its loss, and target networks.
+"""The softmax value of the next state, the critic's target and loss, and target networks."""
 
-softmax_beta(Q) = integral of exp(beta Q(a)) Q(a) da / integral of exp(beta Q(a)) da, estimated from
-noisy actions a_i ~ p with weights exp(beta Q(a_i)) / p(a_i): Algorithm 1 line 17, as SD3,
-arXiv:2010.09177.
-"""
-
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -19,9 +13,10 @@ from csac_jax.config import LearnConfig, TargetConfig
 
 
 def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike) -> jax.Array:
-    """Estimates softmax_beta [] by self-normalised importance sampling, sum w_i q_i / sum w_i.
+    """Estimates int exp(beta Q(a)) Q(a) da / int exp(beta Q(a)) da [] from samples, line 17.
 
-    Only distances below the largest q are weighted: rounding cannot pass that q.
+    As SD3 (arXiv:2010.09177): sum w_i q_i / sum w_i with w_i = exp(beta q_i) / p_i. Only distances
+    below the largest q are weighted: rounding cannot pass that q.
 
     Args: q [N] finite values; log_density [N] log p of the samples; inverse_temperature [] beta.
     """
@@ -33,14 +28,12 @@ def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike
 def noisy_actions(
     key: jax.Array, cfg: TargetConfig, mean: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Draws poses around `mean` [3] in the box, and the log density of each.
+    """Draws actions [samples, 3] around `mean` [3], and log densities [samples] in the box.
 
     a = mu + eps, eps ~ N(0, std) truncated to [-clip, clip] (Algorithm 1 line 13, SD3), x and y
     also to the box, yaw to half a turn: no pose can be drawn in two ways. Deviation: line 13 clips
     the normal, which has no density at its bounds. p = phi(eps / std) / (std Z), Z = Phi(high /
     std) - Phi(low / std), of which nothing cancels as low <= 0 <= high.
-
-    Returns: actions [samples, 3]; log density [samples] per unit of the box.
     """
     centre = box.project(mean)
     wall_low = jnp.where(box.POSE_WRAPS, -1.0, -1.0 - centre)
@@ -55,15 +48,11 @@ def noisy_actions(
     return box.project(centre[None] + cfg.std * noise), log_density
 
 
-TD_LOSSES: dict[str, Callable[[LearnConfig, jax.Array], jax.Array]] = {
-    "huber": lambda cfg, error: optax.losses.huber_loss(error, delta=cfg.huber),  # CSAC sec. 4
-    "squared": lambda cfg, error: optax.losses.squared_error(error),  # Algorithm 1 line 21
-}
-
-
 def td_loss(cfg: LearnConfig, error: jax.Array) -> jax.Array:
-    """Computes the loss of TD errors, any shape."""
-    return TD_LOSSES[cfg.loss](cfg, error)
+    """Computes the loss of TD errors, any shape: Algorithm 1 line 21, or Huber's of CSAC sec. 4."""
+    if cfg.loss == "squared":
+        return optax.losses.squared_error(error)
+    return optax.losses.huber_loss(error, delta=cfg.huber)
 
 
 def td_target(

@@ -54,9 +54,8 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
     tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.pad_fraction)
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
-    resolved = cfg.change(sim={"gripper": grippers.resolve(cfg.sim.gripper)})
+    sim = dataclasses.replace(cfg.sim, gripper=grippers.resolve(cfg.sim.gripper))
     xy, yaws = _cells(rotations, side, cell)
-    inside = np.all(np.abs(xy) <= 0.5 * extent, axis=-1)
     return Frames(
         tables=tables,
         yaws=yaws,
@@ -68,8 +67,8 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         shows_target=cfg.task.kind == "target",
         all_cells=cfg.policy.action_mask == "none",
         xy=xy,
-        inside=inside,
-        reachable=_reachable(resolved.sim, cfg.heightmap, rotations, side, cell),
+        inside=np.all(np.abs(xy) <= 0.5 * extent, axis=-1),
+        reachable=_reachable(sim, cfg.heightmap, rotations, side, cell),
     )
 
 
@@ -91,13 +90,11 @@ def _reachable(
     xy, yaws = _cells(rotations, side, cell)
     if sim.robot == "hand":
         return np.ones((len(Primitive), *xy.shape[:3]), bool)
-
     reachable = functools.partial(primitives.reachable, sim, heightmap)
-    over_cells = jax.vmap(jax.vmap(reachable, (None, 0, None)), (None, 0, None))
-    over_yaws = jax.vmap(over_cells, (None, 0, 0))
+    for axes in ((None, 0, None), (None, 0, None), (None, 0, 0), (0, None, None)):
+        reachable = jax.vmap(reachable, axes)
     with jax.ensure_compile_time_eval():
-        table = jax.jit(jax.vmap(over_yaws, (0, None, None)))
-        return np.asarray(table(jnp.arange(len(Primitive)), xy, yaws))
+        return np.asarray(jax.jit(reachable)(jnp.arange(len(Primitive)), xy, yaws))
 
 
 @struct.dataclass
@@ -145,16 +142,16 @@ def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
-    Grasp: a surface higher than BARE, in the target task the target's, lies under the cell. Push:
-    such a surface, of any block, lies within the push's length ahead. With `policy.action_mask`
-    none: every cell inside the workspace. The robot must reach the cell in each case.
+    Grasp: a surface higher than BARE lies under the cell, in the target task the target's. Push: a
+    surface of any block lies within the push's length ahead. With `policy.action_mask` none: every
+    cell inside the workspace. The robot must reach the cell in each case.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
         return jnp.asarray(allowed)
-    graspable = under = _cells_above_bare(frames, obs.height)
+    graspable = under = cell_heights(frames, obs.height) > BARE
     if frames.shows_target:
-        graspable = _cells_above_bare(frames, jnp.where(obs.target, obs.height, 0.0))
+        graspable = cell_heights(frames, jnp.where(obs.target, obs.height, 0.0)) > BARE
     reach = int(np.ceil(frames.push_length / frames.cell))
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
@@ -162,16 +159,11 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     return jnp.stack([ahead, graspable]) & allowed
 
 
-def _cells_above_bare(frames: Frames, height: jax.Array) -> jax.Array:
-    return cell_heights(frames, height) > BARE
-
-
 def cell_heights(frames: Frames, height: jax.Array) -> jax.Array:
     """Returns the highest point of the map [H, W] m under each cell, [K, h, w] m; 0 outside."""
     side, stride = frames.side, frames.networks.stride
     rotated = rotate.rotate(frames.tables, height[..., None])
-    blocks = rotated.reshape(-1, side, stride, side, stride)
-    cells = blocks.max(axis=(2, 4))  # [K / 2, h, w]
+    cells = rotated.reshape(-1, side, stride, side, stride).max(axis=(2, 4))  # [K / 2, h, w]
     return _all_frames(cells, cells)
 
 
@@ -182,10 +174,8 @@ def yaw_index(frames: Frames, yaw: jax.Array) -> jax.Array:
 
 def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     """Interpolates `maps` [P, K, h, w] at a pose [3] m, m, rad: []; differentiable in both."""
-    num, side = frames.yaws.shape[0], frames.side
-    index = yaw_index(frames, pose[2])
+    num, side, index = frames.yaws.shape[0], frames.side, yaw_index(frames, pose[2])
     lower = rotate.floor(index)
-    upper_weight = index - lower
 
     def at(k: jax.Array) -> jax.Array:
         k = jnp.mod(k, num)
@@ -196,6 +186,7 @@ def read(frames: Frames, maps: jax.Array, primitive: jax.Array, pose: jax.Array)
         return rotate.bilinear(maps.reshape(-1, side), row_col + offset)
 
     below, above = jax.vmap(at)(lower.astype(jnp.int32) + np.arange(2, dtype=np.int32))
+    upper_weight = index - lower
     return (1.0 - upper_weight) * below + upper_weight * above
 
 
@@ -238,6 +229,11 @@ def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
     """Returns the pose [3] (x m, y m, yaw rad) of the cell of flat index [] into [K, h, w]."""
     xy = jnp.asarray(frames.xy).reshape(-1, 2)[index]
     return jnp.append(xy, jnp.asarray(frames.yaws)[index // frames.side**2])
+
+
+def cell_point(frames: Frames, index: jax.Array) -> jax.Array:
+    """Returns `cell_pose` as a point of the box [3]."""
+    return normalise(frames, cell_pose(frames, index))
 
 
 def normalise(frames: Frames, pose: jax.Array) -> jax.Array:

@@ -30,11 +30,8 @@ def candidates(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> jax.Ar
 
 def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
     search = POSE_SEARCHES[learner.cfg.policy.place]
-    return maps.map_primitives(
-        lambda p, single: search(jax.random.fold_in(key, p), learner, single),
-        state,
-        tuple(Primitive),
-    )
+    call = lambda p, single: search(jax.random.fold_in(key, p), learner, single)  # noqa: E731
+    return maps.map_primitives(call, state, tuple(Primitive))
 
 
 def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
@@ -46,20 +43,19 @@ def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
     cfg, frames = learner.cfg.cem, learner.frames
 
     def score(u: jax.Array) -> jax.Array:
-        pose = maps.denormalise(frames, u)
-        value, valid = maps.read_valid(frames, state, 0, pose)
+        value, valid = maps.read_valid(frames, state, 0, maps.denormalise(frames, u))
         return jnp.where(valid, value, value - learner.return_range)
 
     mean = maps.normalise(frames, actor.pose(frames, state, 0))
     cells = maps.best_cells(state.q[0], state.valid[0], cfg.elites)
-    poses = jax.vmap(lambda cell: maps.normalise(frames, maps.cell_pose(frames, cell)))(cells)
-    return cem.maximise(key, cfg, score, *CEM_STARTS[cfg.start](mean, poses))
+    points = jax.vmap(maps.cell_point, (None, 0))(frames, cells)
+    return cem.maximise(key, cfg, score, *CEM_STARTS[cfg.start](mean, points))
 
 
 def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
     """Returns the centre of the valid cell where Q of primitive 0 is largest (VPG)."""
     cell = maps.best_cells(state.q[0], state.valid[0], 1)[0]
-    u = maps.normalise(learner.frames, maps.cell_pose(learner.frames, cell))
+    u = maps.cell_point(learner.frames, cell)
     return CEMResult(u, state.q[0].reshape(-1)[cell], u[None])
 
 
@@ -79,12 +75,12 @@ PRIMITIVE_RULES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 }
 
 
-def random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array:
+def _random_places(key: jax.Array, frames: Frames, valid: jax.Array) -> jax.Array:
     """Draws one valid cell per primitive as a point of the box [P, 3]; `valid` [P, K, h, w]."""
 
     def place(p: jax.Array, valid: jax.Array) -> jax.Array:
         cell = explore.random_cell(jax.random.fold_in(key, p), valid.reshape(-1))
-        return maps.normalise(frames, maps.cell_pose(frames, cell))
+        return maps.cell_point(frames, cell)
 
     return jax.vmap(place)(jnp.arange(len(Primitive)), valid)
 
@@ -99,9 +95,9 @@ def act(
     """Chooses the action to try while learning: greedy with exploration, lines 8-13."""
     key_search, key_places, key_choose = jax.random.split(key, 3)
     best = greedy(key_search, learner, state, steps_without_change)
-    places = random_places(key_places, learner.frames, state.valid)
+    places = _random_places(key_places, learner.frames, state.valid)
     primitive, u = explore.choose(key_choose, learner.cfg.explore, actions_taken, best, places)
-    return Action(primitive=primitive, pose=maps.denormalise(learner.frames, u))
+    return Action(primitive, maps.denormalise(learner.frames, u))
 
 
 def best_action(
@@ -109,8 +105,7 @@ def best_action(
 ) -> Action:
     """Returns the greedy action, without exploration."""
     best = greedy(key, learner, state, steps_without_change)
-    pose = maps.denormalise(learner.frames, best.poses[best.primitive])
-    return Action(primitive=best.primitive, pose=pose)
+    return Action(best.primitive, maps.denormalise(learner.frames, best.poses[best.primitive]))
 
 
 def after_failures(
@@ -118,7 +113,7 @@ def after_failures(
 ) -> DenseMaps:
     """Adds Gumbel noise to Q after `failed_grasps` [] in a row.
 
-    So the best cell is a draw from Boltzmann's law, of a temperature that rises with each failure.
+    The best cell is then a draw from Boltzmann's law, whose temperature rises with each failure.
     """
     if learner.cfg.policy.retry_temperature == 0.0:
         return state
@@ -129,5 +124,5 @@ def after_failures(
 
 def random_grasp(key: jax.Array, frames: Frames, valid: jax.Array) -> Action:
     """Draws a grasp at a random valid cell, whose frame gives the yaw; `valid` [P, K, h, w]."""
-    u = random_places(key, frames, valid)[Primitive.GRASP]
-    return Action(primitive=jnp.int32(Primitive.GRASP), pose=maps.denormalise(frames, u))
+    u = _random_places(key, frames, valid)[Primitive.GRASP]
+    return Action(jnp.int32(Primitive.GRASP), maps.denormalise(frames, u))

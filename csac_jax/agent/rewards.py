@@ -1,6 +1,5 @@
 """Rewards of one action, CSAC eqs. 10-16: R = r + Gamma(phi) I."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -23,19 +22,12 @@ class ActionResult(NamedTuple):
 
 
 def gains_value(cfg: RewardConfig, before: jax.Array, after: jax.Array) -> jax.Array:
-    """Checks that the best grasp's value phi, any shape, rose by more than the dead band."""
+    """Checks that the best grasp's value phi, any shape, rose above the dead band, eq. 16."""
     return after > before + cfg.dead_band
 
 
-def _eq_16(cfg: RewardConfig, result: ActionResult) -> jax.Array:
+def _gained(cfg: RewardConfig, result: ActionResult) -> jax.Array:
     return gains_value(cfg, result.phi_before, result.phi_after)
-
-
-GOOD_PUSH: dict[str, Callable[[RewardConfig, ActionResult], jax.Array]] = {
-    "stored": _eq_16,
-    "current_critic": _eq_16,
-    "map_changed": lambda cfg, result: result.changed,  # VPG
-}
 
 
 def scale(cfg: RewardConfig, level: float) -> float:
@@ -43,26 +35,12 @@ def scale(cfg: RewardConfig, level: float) -> float:
     return cfg.eta[0] + cfg.eta[1] * 2.0 ** (level - cfg.grasp_level)
 
 
-def base(cfg: RewardConfig, lifted: jax.Array, distance: jax.Array) -> jax.Array:
-    """Computes r = r2 - w r1 [], eqs. 10-11: `lifted` [] bool earns r2, r1 is `distance` [] m.
-
-    Deviation: the paper adds r1, which would reward staying away from the target.
-    """
-    loss = cfg.distance_weight * jnp.minimum(distance, cfg.distance_cap)
-    return jnp.where(lifted, cfg.success_bonus, 0.0) - loss
-
-
 def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
     """Returns I_g [] of `outcome` [] int32, eq. 15."""
     return jnp.asarray(cfg.grasp_levels, jnp.float32).at[outcome].get(mode="clip")
 
 
-def push_effect(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """Returns I_c [] of a push, good or not by `push_label`."""
-    return push_level(cfg, GOOD_PUSH[cfg.push_label](cfg, result))
-
-
-def push_level(cfg: RewardConfig, good: jax.Array) -> jax.Array:
+def push_effect(cfg: RewardConfig, good: jax.Array) -> jax.Array:
     """Returns I_c of pushes that are `good` or not, any shape, from `push_levels`."""
     worse, better = cfg.push_levels
     return jnp.where(good, better, worse)
@@ -70,27 +48,31 @@ def push_level(cfg: RewardConfig, good: jax.Array) -> jax.Array:
 
 def relabel(cfg: RewardConfig, reward: jax.Array, was: jax.Array, good: jax.Array) -> jax.Array:
     """Corrects rewards of pushes, any shape, from label `was` to label `good`."""
-    change = push_level(cfg, good) - push_level(cfg, was)
+    change = push_effect(cfg, good) - push_effect(cfg, was)
     return reward + scale(cfg, cfg.push_level) * change
 
 
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
-    """Computes R = r + Gamma(phi) I [], eqs. 12 and 14; a push earns no r2.
+    """Computes R = r + Gamma(phi) I [], eqs. 10-14: r = r2 - w r1, r1 the distance, r2 for a lift.
 
-    Ours: an action that loses blocks costs `lost_block_penalty` once.
+    Deviation: the paper adds r1, which would reward staying away from the target. Ours: an action
+    that loses blocks costs `lost_block_penalty` once.
     """
     grasped = result.primitive == Primitive.GRASP
     grasp = scale(cfg, cfg.grasp_level) * grasp_effect(cfg, result.outcome)
-    push = scale(cfg, cfg.push_level) * push_effect(cfg, result)
+    good = result.changed if cfg.push_label == "map_changed" else _gained(cfg, result)
+    push = scale(cfg, cfg.push_level) * push_effect(cfg, good)
     lifted = grasped & (result.outcome == Outcome.LIFTED)
+    loss = cfg.distance_weight * jnp.minimum(result.distance, cfg.distance_cap)
+    base = jnp.where(lifted, cfg.success_bonus, 0.0) - loss
     penalty = jnp.where(result.blocks_lost > 0, cfg.lost_block_penalty, 0.0)
-    return base(cfg, lifted, result.distance) + jnp.where(grasped, grasp, push) - penalty
+    return base + jnp.where(grasped, grasp, push) - penalty
 
 
 def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax.Array]:
     """Computes rewards [E] and which pushes were good [E] bool, of results with leaves [E]."""
     all_rewards = jax.vmap(reward, (None, 0))(cfg, results)
-    return all_rewards, (results.primitive == Primitive.PUSH) & _eq_16(cfg, results)
+    return all_rewards, (results.primitive == Primitive.PUSH) & _gained(cfg, results)
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:

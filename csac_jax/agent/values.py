@@ -20,63 +20,47 @@ SHARPNESS = 10.0  # logit per unit of Q: how the critic's own map enters the act
 _QUARTERS = 4  # parts of a batch that phi is computed for one after the other (ours)
 
 
-def dense_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
-    """Computes dense maps of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w]."""
-    return _with_actor(learner, params, obs, *critic_maps(learner, params.critic, obs))
-
-
-def exploration_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
-    """Computes the maps that an exploring policy acts on: `dense_maps` + `policy.height_bonus`."""
-    return _with_height_bonus(learner, obs, dense_maps(learner, params, obs))
-
-
-def decision_maps(learner: ActorCritic, params: Params, obs: Observation) -> DenseMaps:
-    """Computes the maps that a policy acts on when it does not explore.
-
-    These are `exploration_maps`; with `policy.augment` Q is the mean over mirror images and
-    critics.
-    """
-    if not learner.cfg.policy.augment:
-        return exploration_maps(learner, params, obs)
-    q, features = _apply_to_passes(learner, params.critic, obs, networks.apply_mirrored)
-    state = _with_actor(learner, params, obs, jnp.mean(q, axis=0), features)
-    return _with_height_bonus(learner, obs, state)
-
-
-def _with_height_bonus(learner: ActorCritic, obs: Observation, state: DenseMaps) -> DenseMaps:
-    if learner.cfg.policy.height_bonus == 0.0:
-        return state
-    heights = jax.vmap(maps.cell_heights, (None, 0))(learner.frames, obs.height)
-    return state.replace(q=state.q + learner.cfg.policy.height_bonus * heights[:, None])
-
-
-def _with_actor(
-    learner: ActorCritic, params: Params, obs: Observation, q: jax.Array, features: jax.Array
+def dense_maps(
+    learner: ActorCritic, params: Params, obs: Observation, mirrored: bool = False
 ) -> DenseMaps:
+    """Computes dense maps of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w].
+
+    With `mirrored` Q is the mean over mirror images and critics.
+    """
+    q, features = critic_maps(learner, params.critic, obs, mirrored)
     correction: Any = jnp.zeros_like(q)
     if learner.cfg.learn.actor:
         correction = learner.frames.networks.head.apply(params.actor, features)
     return unfold_maps(learner, obs, q, correction)
 
 
-def critic_maps(learner: ActorCritic, critic: Any, obs: Observation) -> tuple[jax.Array, Any]:
-    """Computes the lower Q of both critics [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
+def decision_maps(
+    learner: ActorCritic, params: Params, obs: Observation, explores: bool = False
+) -> DenseMaps:
+    """Computes the maps that a policy acts on: `dense_maps` with `policy.height_bonus`.
 
-    Also returns the first critic's features [B, K / 2, ., ., F].
+    Unless it explores, `policy.augment` counts too.
     """
-    q, features = _apply_to_passes(learner, critic, obs, networks.apply)
-    return jnp.min(q, axis=0), features
+    cfg = learner.cfg.policy
+    state = dense_maps(learner, params, obs, cfg.augment and not explores)
+    if cfg.height_bonus == 0.0:
+        return state
+    heights = jax.vmap(maps.cell_heights, (None, 0))(learner.frames, obs.height)
+    return state.replace(q=state.q + cfg.height_bonus * heights[:, None])
 
 
-def _apply_to_passes(
-    learner: ActorCritic, critic: Any, obs: Observation, apply: Callable[..., Any]
+def critic_maps(
+    learner: ActorCritic, critic: Any, obs: Observation, mirrored: bool = False
 ) -> tuple[jax.Array, Any]:
-    """Applies each critic to the K / 2 passes: Q [M, B, K / 2, h, w, OUTPUTS], first features."""
-    rotated = jax.vmap(maps.rotated_inputs, (None, 0))(learner.frames, obs)
-    q, features = map_critics(
-        lambda variables: apply(learner.frames.networks, variables, rotated), critic
-    )
-    return q, features[0]
+    """Computes Q of both critics as one [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
+
+    Also returns the first critic's features [B, K / 2, ., ., F]. See `dense_maps` for `mirrored`.
+    """
+    apply, join = (networks.apply_mirrored, jnp.mean) if mirrored else (networks.apply, jnp.min)
+    frames = learner.frames
+    rotated = jax.vmap(maps.rotated_inputs, (None, 0))(frames, obs)
+    q, features = map_critics(lambda variables: apply(frames.networks, variables, rotated), critic)
+    return join(q, axis=0), features[0]
 
 
 def map_critics(call: Callable[[Any], Any], variables: Any) -> Any:
@@ -118,8 +102,8 @@ def best_grasps(
 ) -> jax.Array:
     """Computes phi_g [B] of the `wanted` [B] bool observations, leaves [B, ...]; else 0.
 
-    Wanted ones are moved to the front. Then quarters of the batch pass through the networks, and a
-    quarter without a wanted one costs nothing. Under vmap all do as many as the largest count asks.
+    Wanted ones are moved to the front. Quarters of the batch pass through the networks, and one
+    without a wanted state costs nothing. Under vmap all do as many as the largest count asks.
     """
     num = wanted.shape[0]
     size = -(-num // _QUARTERS)
@@ -127,14 +111,12 @@ def best_grasps(
     places = jnp.nonzero(wanted, size=num + -num % size, fill_value=num)[0]
     rows = places.astype(jnp.int32).reshape(-1, size)
 
-    def unfinished(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
-        return carry[0] * size < jnp.sum(wanted)
-
     def quarter(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         done, values = carry
         part = jax.tree.map(lambda leaf: leaf.at[rows[done]].get(mode="clip"), obs)
         phi = jax.vmap(best_grasp)(dense_maps(learner, params, part))
         return done + 1, values.at[rows[done]].set(phi, mode="drop")
 
+    unfinished = lambda carry: carry[0] * size < jnp.sum(wanted)  # noqa: E731
     _, values = jax.lax.while_loop(unfinished, quarter, (jnp.int32(0), jnp.zeros(num)))
     return jnp.where(wanted, values, 0.0)

@@ -1,7 +1,7 @@
 """Networks of several runs under `vmap`: in which form they work, and how many at a time.
 
-All DenseNet-121s at once need the memory of all and gain little: each fills a device by itself. One
-by one, their many small products leave the device waiting.
+All DenseNet-121s at once need the memory of all and gain little. One by one, their many small
+products leave the device waiting.
 """
 
 from collections.abc import Callable
@@ -35,8 +35,8 @@ def chunk_size(cfg: Config, runs: int) -> int | None:
 def vmap_in_chunks(function: Callable[..., Any], size: int) -> Callable[..., Any]:
     """Wraps `function`: under `vmap` it runs in chunks of `size` rows, one after the other.
 
-    A chunk of one row is not vmapped, so that a branch stays one. The size must divide the vmapped
-    axis. `function` may close over no tracer of that vmap.
+    `size` divides the vmapped axis. A chunk of one row is not vmapped, so that a branch stays one.
+    `function` may close over no tracer of that vmap.
     """
     chunked = jax.custom_batching.custom_vmap(function)
 

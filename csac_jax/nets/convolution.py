@@ -3,10 +3,10 @@
 CPU: XLA is slow at convolutions with batch and channels swapped inside `lax.scan`, which autodiff
 makes. Here the swap is a transpose and every convolution is plain.
 
-GPU: the gradient of a dilated kernel is computed tap by tap, and the first convolution, of few
-channels and many taps, is a matrix product. Under `vmap` of several runs XLA makes grouped
-convolutions, which are slow. By taps a convolution is one matrix product, whose parts are shifted
-and added. Its product needs memory, so thousands of passes keep the grouped one.
+GPU: the gradient of a dilated kernel is computed tap by tap. The first convolution, of few channels
+and many taps, is a matrix product. Under `vmap` of several runs XLA makes grouped convolutions,
+which are slow. By taps each is one matrix product, whose parts are shifted and added. Its product
+needs memory, so thousands of passes keep the grouped one.
 """
 
 import functools
@@ -34,11 +34,7 @@ def conv2d(
 
 
 def _product_of_blocks(maps: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    """Computes a convolution whose kernel is two strides wide as a matrix product.
-
-    The padding is half a stride. Each output cell is a product of 2 x 2 blocks of stride x stride
-    input cells.
-    """
+    """Computes a convolution by a kernel of two strides as a product of 2 x 2 blocks per cell."""
     batch, rows, cols, ins = maps.shape
     high, wide, half = rows // stride, cols // stride, stride // 2
     padded = jnp.pad(maps, ((0, 0), (half, half), (half, half), (0, 0)))
@@ -70,10 +66,9 @@ def _maps_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
 def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
     """Computes d loss / d kernel [k, k, I, O]: maps, channels as batch, times the gradient.
 
-    If the gradient has fewer channels, a CPU convolves the other way round: fewer channels as batch
-    are faster. That gives the flipped kernel. A CPU also takes rows two apart, with zeros between
-    them, which changes no sum: XLA's convolution library (`runtime.compiler`) leaves those to
-    Eigen, two to three times as fast at so few outputs.
+    A CPU is faster with fewer channels as batch, so it may convolve the other way round, which
+    gives the flipped kernel. It also takes rows two apart, with zeros between them: XLA's library
+    (`runtime.compiler`) leaves those to Eigen, two to three times as fast at so few outputs.
     """
     maps, kernel = saved
     size, on_cpu = kernel.shape[0], jax.default_backend() == "cpu"
@@ -92,9 +87,7 @@ def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
         (row_stride, 1),
         (row_stride * stride, stride),
     )[:, :size, :size]  # [I, k, k, O]
-    if swapped:
-        return jnp.transpose(taps, (1, 2, 3, 0))[::-1, ::-1]
-    return jnp.transpose(taps, (1, 2, 0, 3))
+    return jnp.moveaxis(taps, 0, 3)[::-1, ::-1] if swapped else jnp.moveaxis(taps, 0, 2)
 
 
 def _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient) -> jax.Array:
@@ -124,10 +117,7 @@ def taps_fit(maps: jax.Array, kernel: jax.Array) -> bool:
 
 
 def convolve_by_taps(maps: jax.Array, kernel: jax.Array, dilation: int) -> jax.Array:
-    """Computes `conv2d` of stride 1 with a kernel of odd size: [B, H, W, O].
-
-    The products of the taps are shifted and added, as fewer channels go out than come in.
-    """
+    """Computes `conv2d` of stride 1 with a kernel of odd size: [B, H, W, O]."""
     size, _, ins, outs = kernel.shape
     matrix = jnp.transpose(kernel, (2, 0, 1, 3)).reshape(ins, -1)
     products = (maps.reshape(-1, ins) @ matrix).reshape(*maps.shape[:-1], size**2 * outs)

@@ -1,8 +1,5 @@
 """The small dense net: densely connected convolutions with group norm on rotated maps.
 
-Features have 1/`net.stride` of the input's resolution. The last 1 x 1 convolution gives
-`net.subpixel`^2 values per cell of them, as sub-pixel convolution (arXiv:1609.05158).
-
 The net sees maps in an action's own frame: a push goes ahead, a grasp closes across. The frame of
 yaw + pi shows the same picture upside down. So each pass gives three maps, push ahead, push back
 and grasp (a parallel gripper is symmetric); K / 2 passes give all K yaws of both primitives.
@@ -70,7 +67,10 @@ class Trunk(nn.Module):
 
 
 class Head(nn.Module):
-    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, outputs], s = subpixel."""
+    """Two 1 x 1 convolutions: [..., h, w, F] -> [..., s h, s w, outputs], s = subpixel.
+
+    The last gives s^2 values per cell, as sub-pixel convolution (arXiv:1609.05158).
+    """
 
     cfg: SmallNet
     outputs: int = OUTPUTS
@@ -89,16 +89,10 @@ def pixel_shuffle(maps: jax.Array, factor: int) -> jax.Array:
     return jnp.swapaxes(parts, -4, -3).reshape(*batch, factor * rows, factor * cols, -1)
 
 
-def num_groups(channels: int) -> int:
-    """Returns the groups of a group norm over so many channels."""
-    return max(channels // _GROUP_SIZE, 1)
-
-
 class GroupNorm(nn.Module):
     """Group norm of maps [B, H, W, F], `_GROUP_SIZE` channels a group.
 
-    On a CPU it takes 0.6 to 0.7 of the time of Flax's: it sums over cells first, with all channels
-    vectorised, then over a group's channels.
+    It sums over cells first, then channels: on a CPU in 0.6 to 0.7 of the time of Flax's.
     """
 
     dtype: Any
@@ -108,7 +102,7 @@ class GroupNorm(nn.Module):
         channels = maps.shape[-1]
         scale = self.param("scale", nn.initializers.ones, (channels,))
         bias = self.param("bias", nn.initializers.zeros, (channels,))
-        groups = num_groups(channels)
+        groups = max(channels // _GROUP_SIZE, 1)
         exact = maps.astype(jnp.float32)
 
         def group_mean(values: jax.Array) -> jax.Array:

@@ -1,9 +1,8 @@
 """DenseNet-121 (arXiv:1608.06993, table 1) as the paper's network over rotated maps, CSAC sec. 3.4.
 
-Colour, height and, in the target task, the mask have a trunk each. Trunks are the same program
-with other weights, stacked along an axis T: leaves [T, ...]. Two 1 x 1 convolutions turn their
-joined features into maps, which are upsampled. One network serves push and grasp. Modules have
-torchvision's names: its weights fit.
+Colour, height and, in the target task, the mask have a trunk each, with weights [T, ...]. Two 1 x 1
+convolutions turn their joined features into maps, which are upsampled. Modules have torchvision's
+names: its weights fit.
 """
 
 import math
@@ -53,8 +52,7 @@ def _piece(maps: jax.Array) -> Piece:
 class BatchNorm(nn.Module):
     """Batch norm of maps [..., F] by the batch's mean and variance [F], or by the running ones.
 
-    The caller gives the batch's: every layer of a block norms the same maps, whose statistics are
-    computed once. Variables are those of `flax.linen.BatchNorm`.
+    Unlike Flax's it is given the batch's: layers of a block share the maps and their statistics.
     """
 
     dtype: Any
@@ -62,8 +60,8 @@ class BatchNorm(nn.Module):
     @nn.compact
     def __call__(self, maps: jax.Array, statistics: Sequence[jax.Array] | None) -> jax.Array:
         shape = maps.shape[-1:]
-        running = [self.variable("batch_stats", "mean", jnp.zeros, shape)]
-        running += [self.variable("batch_stats", "var", jnp.ones, shape)]
+        starts = (("mean", jnp.zeros), ("var", jnp.ones))
+        running = [self.variable("batch_stats", name, start, shape) for name, start in starts]
         scale = self.param("scale", nn.initializers.ones, shape)
         bias = self.param("bias", nn.initializers.zeros, shape)
         mean, variance = statistics or [variable.value for variable in running]
@@ -71,8 +69,8 @@ class BatchNorm(nn.Module):
             for variable, value in zip(running, statistics, strict=True):
                 variable.value = _MOMENTUM * variable.value + (1.0 - _MOMENTUM) * value
         factor = scale * jax.lax.rsqrt(variance + _EPSILON)
-        leaves = (factor, bias - mean * factor)
-        factor, shift = (leaf.reshape((1,) * (maps.ndim - 1) + shape) for leaf in leaves)
+        ones = (1,) * (maps.ndim - 1)
+        factor, shift = (leaf.reshape(ones + shape) for leaf in (factor, bias - mean * factor))
         return (maps.astype(jnp.float32) * factor + shift).astype(self.dtype)
 
 
@@ -104,8 +102,7 @@ class DenseLayer(nn.Module):
 class DenseBlock(nn.Module):
     """Dense layers, each on all pieces before it; returns all.
 
-    A norm joins the pieces that it reads. To join them after every layer, as the paper draws it,
-    would write all channels once more per layer.
+    A norm joins the pieces that it reads: joined after every layer, all would be written again.
     """
 
     cfg: DenseNet121
@@ -166,13 +163,9 @@ class DenseNetHead(nn.Module):
         hidden = nn.Dense(cfg.head, use_bias=False, dtype=compute_dtype(cfg), name="conv0")(hidden)
         hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
         maps = nn.Dense(OUTPUTS, kernel_init=OUTPUT_INIT, name="conv1")(hidden)
-        return _upsample(maps, DenseNet121.STRIDE // (cfg.upsample * cfg.output_stride))
-
-
-def _upsample(maps: jax.Array, factor: int) -> jax.Array:
-    """Resizes maps [..., h, w, F] to `factor` times the resolution, bilinear."""
-    *batch, rows, cols, channels = maps.shape
-    return jax.image.resize(maps, (*batch, factor * rows, factor * cols, channels), "bilinear")
+        *batch, rows, cols, outputs = maps.shape
+        factor = DenseNet121.STRIDE // (cfg.upsample * cfg.output_stride)
+        return jax.image.resize(maps, (*batch, factor * rows, factor * cols, outputs), "bilinear")
 
 
 class DenseNetCritic(nn.Module):
@@ -199,10 +192,10 @@ class DenseNetCritic(nn.Module):
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """Splits maps [B, C, C, I] into inputs of the trunks [T, B, z C, z C, 3].
+    """Splits maps [B, C, C, I] into colour and, three times each, the others: [T, B, z C, z C, 3].
 
-    They are colour and, each repeated three times, the other maps. z = upsample / 2, at least 1: a
-    trunk doubles its cells itself. The barrier keeps XLA from rotating the maps once per window.
+    z = upsample / 2, at least 1: a trunk doubles its cells itself. The barrier keeps XLA from
+    rotating the maps once per window.
     """
     inputs = [maps[..., :3]] if cfg.colour else []
     others = range(3 * len(inputs), maps.shape[-1])

@@ -1,9 +1,9 @@
 """The networks of a run, and their variables: parameters and running statistics of batch norm.
 
 A critic turns maps [N, C, C, I] into Q [N, h, w, OUTPUTS] and features; the actor's head turns the
-features into maps of Q's shape. Called with `train`, batch norm takes the statistics of the batch,
-else the running ones. A custom critic is any Flax module of that signature with an attribute
-`stride`, C / h; its features have the cells of Q.
+features into maps of Q's shape. With `train`, batch norm takes the batch's statistics. A custom
+critic is any Flax module of that signature with an attribute `stride`, C / h; its features have the
+cells of Q.
 """
 
 import dataclasses
@@ -21,8 +21,6 @@ from csac_jax.nets import dense, densenet
 BARE = 0.002  # m: lower cells are bare table, whose colour no net sees
 FINGERS_MEAN = np.array([0.1, 0.014, 0.02], np.float32)  # m, `grippers.Fingers`; ours
 FINGERS_STD = np.array([0.025, 0.004, 0.004], np.float32)
-MIRRORS = ((), (2,), (3,), (2, 3))  # axes of passes that are turned; columns lie along the frame
-AHEAD_AND_BACK = (1, 0, 2)  # `dense.OUTPUTS`, pushes swapped, as in a mirror along the frame
 _FULL = 640  # px (ours): side of passes at which the critic gets one state at a time
 
 
@@ -48,11 +46,9 @@ class Networks:
     ) -> jax.Array:
         """Builds the critic's input maps [..., H, W, I].
 
-        3 of colour or none, 1 of height, 3 of the fingers or none, 1 of target or none. Bare table
-        is 0, like cells outside of a rotated map.
-
-        Args: colour [..., H, W, 3] in 0..1; height [..., H, W] m; target [..., H, W] bool or None;
-        fingers [..., 3] m or None.
+        In order: 3 of `colour` [..., H, W, 3] in 0..1 if it is seen, 1 of `height` [..., H, W] m, 3
+        of `fingers` [..., 3] m, 1 of `target` [..., H, W] bool. Bare table is 0, like cells outside
+        of a rotated map.
         """
         maps = [jnp.maximum(height, 0.0)[..., None] / self.height_scale]
         if self.colour:
@@ -74,8 +70,8 @@ class Networks:
     def states_at_once(self, canvas: int) -> int | None:
         """Returns the states, of canvas x canvas cells, in a call of the critic; None for any.
 
-        DenseNet-121 gets groups of the pixels of one state at 640 px (ours). So all its calls
-        consist of the same products, which XLA tunes one by one, and need the memory of one group.
+        DenseNet-121 gets groups of the pixels of one state at 640 px (ours). All its calls then
+        consist of the same products, which XLA tunes once, and need the memory of one group.
         """
         return max(1, round((_FULL / (self.upsample * canvas)) ** 2)) if self.upsample else None
 
@@ -116,15 +112,13 @@ def apply(networks: Networks, variables: Any, maps: jax.Array) -> tuple[jax.Arra
 def apply_mirrored(
     networks: Networks, variables: Any, maps: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Computes `apply` with Q averaged over four mirror images of each pass.
-
-    They are mirrored along and across its frame. A mirror along it swaps pushes ahead and back.
-    """
-    mirrored = jnp.concatenate([jnp.flip(maps, axes) for axes in MIRRORS], axis=1)
+    """Computes `apply` with Q averaged over four mirror images of each pass, in its frame."""
+    mirrors = ((), (2,), (3,), (2, 3))  # axes; one along the frame, 3, swaps pushes ahead and back
+    mirrored = jnp.concatenate([jnp.flip(maps, axes) for axes in mirrors], axis=1)
     q, features = apply(networks, variables, mirrored)
     turned_back = [
-        jnp.flip(part, axes)[..., np.array(AHEAD_AND_BACK) if 3 in axes else slice(None)]
-        for part, axes in zip(jnp.split(q, len(MIRRORS), axis=1), MIRRORS, strict=True)
+        jnp.flip(part, axes)[..., np.array([1, 0, 2]) if 3 in axes else slice(None)]
+        for part, axes in zip(jnp.split(q, len(mirrors), axis=1), mirrors, strict=True)
     ]
     return jnp.mean(jnp.stack(turned_back), axis=0), features[:, : maps.shape[1]]
 

@@ -36,8 +36,8 @@ class TapConvolution(nn.Module):
 class Stem(nn.Module):
     """The first convolution, of stride 2: [B, H, W, I] -> [B, H / 2, W / 2, features].
 
-    The windows of all taps are joined, as few channels come in. With `doubled` each cell of the
-    maps stands for 2 x 2 pixels, which are not built: [B, H, W, I] -> [B, H, W, features].
+    With `doubled` each cell of the maps stands for 2 x 2 pixels, which are not built: [B, H, W, I]
+    -> [B, H, W, features].
     """
 
     features: int
@@ -51,17 +51,11 @@ class Stem(nn.Module):
             side = (_STEM + 1) // 2
             padded = jnp.pad(kernel, ((1, 0), (1, 0), (0, 0), (0, 0)))
             kernel = padded.reshape(side, 2, side, 2, *kernel.shape[2:]).sum((1, 3))
-        taps = windows(maps, len(kernel), 1 if self.doubled else 2)
-        return _times(jnp.concatenate(taps, axis=-1), kernel.astype(self.dtype))
-
-
-def _times(maps: jax.Array, matrix: jax.Array) -> jax.Array:
-    """Multiplies maps [..., I] with a matrix of I rows, of any axes: [..., O].
-
-    A plain product: over several axes XLA would transpose all maps for the matrix's gradient.
-    """
-    rows = maps.shape[-1]
-    return (maps.reshape(-1, rows) @ matrix.reshape(rows, -1)).reshape(*maps.shape[:-1], -1)
+        taps = jnp.concatenate(windows(maps, len(kernel), 1 if self.doubled else 2), axis=-1)
+        # A plain product: over several axes XLA would transpose all taps for the kernel's gradient.
+        rows, matrix = taps.shape[-1], kernel.astype(self.dtype)
+        product = taps.reshape(-1, rows) @ matrix.reshape(rows, -1)
+        return product.reshape(*taps.shape[:-1], -1)
 
 
 @jax.custom_vjp

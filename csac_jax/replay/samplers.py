@@ -1,7 +1,5 @@
 """Samplers of replayed transitions: uniform (CSAC), prioritised (CSAC-PER), by rank (CSAC-beta), or
-of opposite outcomes (VPG).
-
-Algorithm 1 lines 15-16. A custom sampler is any object with the methods of `Sampler`.
+of opposite outcomes (VPG); Algorithm 1 lines 15-16.
 """
 
 import abc
@@ -53,14 +51,12 @@ class Sampler(abc.ABC):
 
 
 def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array:
-    """Draws slots with P(i) = m_i / sum m; Schaul et al. 2016, eq. 1 with m = p^alpha.
+    """Draws [num] slots with P(i) = m_i / sum m; Schaul et al. 2016, eq. 1 with m = p^alpha.
 
     Each draw descends a pyramid of sums, built for every batch: unlike a sum tree it cannot drift.
     The lower half has a uniform number of its own: one float32 has 2^23 values, too few for 2^17
-    slots. Draws are independent, not stratified as in sec. B.2.1.
-
-    Args: masses [C], at least 0, and 0 where nothing is stored: such slots are never drawn.
-    Returns: [num] int32 slots, with repetition; slot 0 .. C - 1 if all masses are 0.
+    slots. Draws are independent, not stratified as in sec. B.2.1. `masses` [C] are 0 where nothing
+    is stored: such slots are never drawn, unless all masses are 0.
     """
     node = jnp.zeros(num, jnp.int32)
     rows = jnp.arange(RADIX, dtype=jnp.int32)[:, None]
@@ -74,10 +70,9 @@ def proportional_slots(key: jax.Array, masses: jax.Array, num: int) -> jax.Array
 
 
 def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Sums levels [RADIX n] up to a top: their upper and lower half, top first.
+    """Sums `masses` [C], padded with 0, to levels [RADIX n]: their upper and lower half, top first.
 
-    The last is `masses` [C] padded with 0. Children of node j < n are j, j + n, j + 2 n ...: sums
-    over the first axis vectorise.
+    Children of node j < n are j, j + n, j + 2 n ...: sums over the first axis vectorise.
     """
     levels: list[jax.Array] = []
     while not levels or levels[0].shape[0] > RADIX:
@@ -90,8 +85,8 @@ def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
 def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Draws rows by the columns of `masses` [RADIX, num]; also returns the rest of `uniform` [num].
 
-    Sequential sums never fall, and a mass of 0 leaves them unchanged: a row of no mass is never the
-    first to exceed the goal. A parallel `cumsum` promises neither.
+    Sequential sums never fall, so that a row of no mass is never the first to exceed the goal. A
+    parallel `cumsum` does not promise it.
     """
     reached = list(itertools.accumulate(masses))  # RADIX of [num]
     goal = uniform * reached[-1]
@@ -106,53 +101,35 @@ def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
     return row, jnp.clip(left, 0.0, BELOW_ONE)
 
 
-def weights(masses: jax.Array, exponent: ArrayLike) -> jax.Array:
-    """Computes w_i = (n P(i))^-beta / max_j w_j [B] of drawn `masses` [B]; Schaul 2016, sec. 3.4.
-
-    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's: by
-    the ring's least likely transition all steps would be small.
-    """
-    masses = jnp.maximum(masses, jnp.finfo(jnp.float32).tiny)  # of an empty ring all are 0
-    return (jnp.min(masses) / masses) ** exponent
-
-
 def beta_slots(
     key: jax.Array, values: jax.Array, size: jax.Array, a: ArrayLike, b: ArrayLike, num: int
 ) -> jax.Array:
-    """Draws slots whose rank by value follows Beta(a, b), rank 0 = largest; sec. 3.5, eq. 17.
+    """Draws [num] slots whose rank by value follows Beta(a, b), rank 0 = largest; sec. 3.5, eq. 17.
 
-    rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Equal
-    values share their ranks at random: by slot, the oldest would be preferred. NaN is ranked first.
-
-    A ring of more than SORTED slots is not sorted: the ranks are those among CANDIDATES random
-    slots, drawn for each batch. The rank among all then has a standard deviation of at most n / (2
-    sqrt(CANDIDATES)); of the laws of CSAC sec. 4.3, no decile's share changes by 0.001.
-
-    Args: values [C], any beyond `size`; size [] filled slots.
-    Returns: [num] int32 slots, with repetition, all filled; slot 0 .. C - 1 if nothing is stored.
+    rank = floor(n x), x ~ Beta(a, b). Beta(1, 1) is uniform, Beta(1, 2) VPG's power law. Slots are
+    the first `size` [] of `values` [C], slot 0 .. C - 1 if nothing is stored.
     """
     key_rank, key_ties = jax.random.split(key)
-    rank_slots = _all_ranked if values.shape[0] <= SORTED else _some_ranked
-    order, count = rank_slots(key_ties, values, size)
+    order, count = _ranked(key_ties, values, size)
     rank = (_beta(key_rank, a, b, num) * count.astype(jnp.float32)).astype(jnp.int32)
     return order[jnp.clip(rank, 0, jnp.maximum(count - 1, 0))]
 
 
-def _all_ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sorts slots [C] by falling value, filled ones first; also returns their number []."""
+def _ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sorts slots [C] by falling value, filled ones first; also returns their number [].
+
+    Equal values share their ranks at random: by slot, the oldest would be preferred. Of a ring of
+    more than SORTED slots, CANDIDATES random ones are sorted. The rank among all then deviates by at
+    most n / (2 sqrt(CANDIDATES)): no decile's share changes by 0.001.
+    """
+    if values.shape[0] > SORTED:
+        some = jax.random.randint(key, (CANDIDATES,), 0, jnp.maximum(size, 1), jnp.int32)
+        order = jax.lax.sort((_descending(values[some]), some), num_keys=1)[1]
+        return order, jnp.int32(CANDIDATES)
     slots = jnp.arange(values.shape[0], dtype=jnp.int32)
     ties = jax.random.bits(key, values.shape)
     filled_first = jnp.where(slots < size, _descending(values), jnp.inf)
     return jax.lax.sort((filled_first, ties, slots), num_keys=2)[2], size
-
-
-def _some_ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sorts CANDIDATES random filled slots by falling value; also returns their number [].
-
-    They are drawn in random order, so that equal values share their ranks.
-    """
-    some = jax.random.randint(key, (CANDIDATES,), 0, jnp.maximum(size, 1), jnp.int32)
-    return jax.lax.sort((_descending(values[some]), some), num_keys=1)[1], jnp.int32(CANDIDATES)
 
 
 def _descending(values: jax.Array) -> jax.Array:
@@ -161,10 +138,7 @@ def _descending(values: jax.Array) -> jax.Array:
 
 
 def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> jax.Array:
-    """Draws a slot [num] from each of `num` equal parts of the newest `among` >= `num`.
-
-    The newest part comes first. Where fewer are stored, the oldest one stands in.
-    """
+    """Draws a slot [num] from each of `num` equal parts of the `among` >= `num` newest."""
     part = jnp.arange(num, dtype=jnp.float32) + jax.random.uniform(key, (num,))
     age = jnp.minimum(jnp.floor(part * (among / num)).astype(jnp.int32), among - 1)
     age = jnp.clip(age, 0, jnp.maximum(state.size - 1, 0))
@@ -174,12 +148,10 @@ def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> ja
 def opposite_slots(
     key: jax.Array, state: ReplayState, slots: jax.Array, a: ArrayLike, b: ArrayLike
 ) -> tuple[jax.Array, jax.Array]:
-    """Draws for each of `slots` [B] one of its primitive and the opposite outcome, if any.
+    """Draws for each of `slots` [B] one of its primitive and the opposite outcome, [B] bool if any.
 
     Zeng et al., code: `main.py`, "experience replay". An outcome is good if its reward is positive.
     The rank by priority follows Beta(a, b) within the transitions that match, rank 0 = largest.
-
-    Returns: slots [B], the slot itself without a match; [B] bool, True with one.
     """
     key_rank, key_ties = jax.random.split(key)
     every = jnp.arange(state.priority.shape[0], dtype=jnp.int32)
@@ -209,10 +181,7 @@ def _beta(key: jax.Array, a: ArrayLike, b: ArrayLike, num: int) -> jax.Array:
 
 
 def _log_gamma(key: jax.Array, shape: ArrayLike, num: int) -> jax.Array:
-    """Draws logarithms [num] from Gamma(shape, 1); Marsaglia and Tsang 2000, ACM TOMS 26, 363.
-
-    The first accepted candidate; a shape below 1 takes Gamma(shape + 1, 1) times U^(1 / shape).
-    """
+    """Draws logarithms [num] from Gamma(shape, 1); Marsaglia and Tsang 2000, ACM TOMS 26, 363."""
     key_normal, key_uniform, key_small = jax.random.split(key, 3)
     shape = jnp.asarray(shape, jnp.float32)
     d = jnp.where(shape < 1.0, shape + 1.0, shape) - 1.0 / 3.0
@@ -238,8 +207,6 @@ def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> list[jax.Array]:
 
 @dataclasses.dataclass(frozen=True)
 class _Configured(Sampler):
-    """Sampler that a replay section describes."""
-
     cfg: Any
     scenes: int = 1  # transitions that a step adds
 
@@ -256,13 +223,18 @@ class Uniform(_Configured):
 
 
 class Prioritised(_Configured):
-    """P(i) ~ (abs(TD error) + epsilon)^alpha; Schaul et al. 2016, sec. 3.3."""
+    """P(i) ~ (abs(TD error) + epsilon)^alpha, w_i = (n P(i))^-beta / max_j w_j; Schaul et al. 2016.
+
+    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's: by
+    the ring's least likely transition all steps would be small.
+    """
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         slots = proportional_slots(key, state.priority, num)
         start, end = self.cfg.is_beta
         exponent = start + (end - start) * jnp.clip(progress, 0.0, 1.0)
-        return Sample(slots, weights(state.priority[slots], exponent))
+        masses = jnp.maximum(state.priority[slots], jnp.finfo(jnp.float32).tiny)  # 0 if empty
+        return Sample(slots, (jnp.min(masses) / masses) ** exponent)
 
     def update(self, state: ReplayState, slots: jax.Array, errors: jax.Array) -> ReplayState:
         """Stores the power itself: at every draw it would be taken of the whole ring."""
@@ -280,11 +252,10 @@ class Beta(_Configured):
 
 
 class Opposite(_Configured):
-    """Half of a batch is new, the other half of opposite outcomes; VPG's code.
+    """Half of a batch is new, the other half of opposite outcomes, of weight 0 without one.
 
     VPG trains once on its newest transition and once on one drawn against it. Of larger batches the
-    first half is spread over the newest transitions, at least those of one step. A draw without a
-    match has weight 0.
+    first half is spread over the newest transitions, at least those of one step.
     """
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
@@ -296,7 +267,7 @@ class Opposite(_Configured):
         return Sample(jnp.append(new, opposite), weights)
 
 
-BUILDERS = {
+BUILDERS: dict[Any, type[_Configured]] = {
     UniformReplay: Uniform,
     PrioritisedReplay: Prioritised,
     BetaReplay: Beta,
@@ -306,5 +277,4 @@ BUILDERS = {
 
 def make(cfg: Any, scenes: int = 1) -> Sampler:
     """Builds the sampler of a replay section, if a step adds a transition of each of `scenes`."""
-    kind: Any = BUILDERS[type(cfg)]
-    return kind(cfg, scenes)
+    return BUILDERS[type(cfg)](cfg, scenes)
