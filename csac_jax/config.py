@@ -519,7 +519,7 @@ class Config(Section):
         require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
         episodic = not self.reward.relabels or self.target.bootstrap == "episodic"
         ending = "by which a transition ends in the scene that the push left"
-        needs = "renewed needs target.bootstrap episodic"
+        needs = "current_critic needs target.bootstrap episodic"
         require(episodic, f"reward.push_label: {needs}, {ending}")
         batch, starts = self.learn.batch, self.train.learning_starts
         early = f"{batch} transitions cannot be drawn after train.learning_starts = {starts}"

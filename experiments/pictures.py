@@ -95,8 +95,7 @@ def moving(
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures [H, W, 3] uint8 of an episode and times, ms; `hold` for a motion's end."""
     policy = policies.load("shipped")
-    cfg = rollout.configured(policy.cfg, "c", "hand")
-    (env,) = suites.prepare(cfg, suite, 1, seed).parts.values()
+    (env,) = suites.prepare(policy.cfg, suite, 1, seed, physics="c").parts.values()
     steps = list(rollout.episode(env, policy.replace(cfg=env.cfg), seed))
     print(suite, episode.summary(env.cfg, steps))
     yield from _pictures(env, steps, every, hold)

@@ -7,8 +7,7 @@ from typing import Any
 import tyro
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments
-from csac_jax.errors import FailedError
+from csac_jax.errors import FailedError, SettingsError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,12 +46,11 @@ def run(arguments: list[str]) -> int:
     """Decides and prints; returns the exit code."""
     options = parsing.parse(ActOptions, arguments, "act")
     if options.check and options.record is not None:
-        raise BadArgumentsError("--record: --check decides nothing; leave one of them out")
+        raise SettingsError("--record: --check decides nothing; leave one of them out")
     if options.png is not None:
         from csac_jax.render import media
 
-        with as_bad_arguments(ValueError):
-            media.check_suffix(options.png, media.PICTURES)
+        media.check_suffix(options.png, media.PICTURES)
     from csac_jax import deploy
     from csac_jax.deploy import image_files
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.errors import SettingsError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,11 +68,11 @@ def run(arguments: list[str]) -> int:
 
 def _check(options: CalibrateOptions) -> None:
     if not options.rgb or options.intrinsics is None:
-        raise BadArgumentsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
+        raise SettingsError("calibrate: give --rgb and --intrinsics, or --board FILE to print")
     if bool(options.robot) != (options.workspace is not None):
-        raise BadArgumentsError("calibrate: --robot and --workspace go together")
+        raise SettingsError("calibrate: --robot and --workspace go together")
     if not options.robot and len(options.rgb) > 1:
-        raise BadArgumentsError("--rgb: one image of a board on the table, or give --robot too")
+        raise SettingsError("--rgb: one image of a board on the table, or give --robot too")
 
 
 def _print(path: Path, printed: Any) -> int:
@@ -79,7 +80,7 @@ def _print(path: Path, printed: Any) -> int:
     from csac_jax.io import files
 
     if path.suffix != ".png":
-        raise BadArgumentsError(f"--board: {path} must end in .png")
+        raise SettingsError(f"--board: {path} must end in .png")
     files.replace(path, image_files.encode(printed.picture(), board.DPI))
     wide, high = (1e3 * side * printed.square for side in (board.COLUMNS, board.ROWS))
     print(

@@ -7,8 +7,9 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax.cli import parsing, settings
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.failures import check_extra
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 
 NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra `export`
 
@@ -52,8 +53,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.io import files, policy_file
 
     policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
-    with as_bad_arguments(ValueError):
-        cfg = policy.cfg.change(policy=settings.decision(options))
+    cfg = policy.cfg.change(policy=settings.decision(options))
     params = policy.params if options.average is None else _mean(policy.params, options.average)
     if options.format == "safetensors":
         policy_file.save(options.file, params, cfg)
@@ -66,15 +66,15 @@ def run(arguments: list[str]) -> int:
 def _check(options: ExportOptions) -> None:
     if options.file.suffix != f".{options.format}":
         kind = "policy file" if options.format == "safetensors" else "program"
-        raise BadArgumentsError(
+        raise SettingsError(
             f"{options.file}: the name of a {kind} ends in .{options.format}, see --format"
         )
     if options.file.exists():
-        raise BadArgumentsError(f"{options.file} exists; give another name")
+        raise SettingsError(f"{options.file} exists; give another name")
     if options.input == "image" and options.format != "stablehlo":
-        raise BadArgumentsError("--input image: needs --format stablehlo")
+        raise SettingsError("--input image: needs --format stablehlo")
     if not all(16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+        raise SettingsError("--size: both numbers must lie in 16 .. 4096 px")
     if options.format in NEEDS:
         check_extra(f"--format {options.format}", NEEDS[options.format], "export")
 
@@ -89,7 +89,7 @@ def _mean(params: Any, source: str) -> Any:
     other = deploy.CameraPolicy.load(source).params
     if difference := leaves.difference(leaves.layout(other), leaves.layout(params)):
         name, has, asked = difference
-        raise BadArgumentsError(
+        raise SettingsError(
             f"--average {source}: has {name} as {has}, the first policy as {asked}; "
             "give policies with the same networks"
         )

@@ -10,7 +10,8 @@ from typing import Any
 import tyro
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import BadArgumentsError, check_seed
+from csac_jax.cli.failures import check_seed
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
 
 INTERVAL = 10.0  # s between lines
@@ -49,7 +50,7 @@ def run(arguments: list[str]) -> int:
     try:
         from csac_jax.deploy import CameraPolicy, fine_tuning
     except ModuleNotFoundError as error:
-        raise BadArgumentsError(
+        raise SettingsError(
             f"finetune needs {error.name}; copy the record to a machine where it is installed"
         ) from None
     from csac_jax.io import policy_file
@@ -72,16 +73,16 @@ def run(arguments: list[str]) -> int:
 
 def _check(options: FinetuneOptions) -> None:
     if options.out.suffix != ".safetensors":
-        raise BadArgumentsError(f"--out: {options.out} must end in .safetensors")
+        raise SettingsError(f"--out: {options.out} must end in .safetensors")
     if options.out.exists():
-        raise BadArgumentsError(f"--out: {options.out} exists; give another name")
+        raise SettingsError(f"--out: {options.out} exists; give another name")
     if options.updates < 1:
-        raise BadArgumentsError("--updates: at least 1")
+        raise SettingsError("--updates: at least 1")
     check_seed(options.seed)
     if not 1 <= options.batch <= 4096:
-        raise BadArgumentsError("--batch: must lie in 1 .. 4096")
+        raise SettingsError("--batch: must lie in 1 .. 4096")
     if not 0.0 < options.learning_rate < 1.0:
-        raise BadArgumentsError("--learning-rate: must lie between 0 and 1")
+        raise SettingsError("--learning-rate: must lie between 0 and 1")
 
 
 def _printer() -> Callable[[Any], None]:

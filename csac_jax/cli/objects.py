@@ -10,14 +10,8 @@ import tyro
 
 from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import (
-    PROGRAM,
-    BadArgumentsError,
-    as_bad_arguments,
-    check_extra,
-    check_seed,
-)
-from csac_jax.errors import FailedError
+from csac_jax.cli.failures import PROGRAM, check_extra, check_seed
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.runtime import processes
 
 
@@ -78,7 +72,7 @@ def run(arguments: list[str]) -> int:
         print(f"usage: {PROGRAM} objects COMMAND ..., with COMMAND one of: {known}")
         return 0 if name else 2
     if name not in COMMANDS:
-        raise BadArgumentsError(f"objects: {unknown('command', name, COMMANDS)}")
+        raise SettingsError(f"objects: {unknown('command', name, COMMANDS)}")
     return COMMANDS[name](rest)
 
 
@@ -88,7 +82,7 @@ def _make(arguments: list[str]) -> int:
     from csac_jax.objects import library, shapes
 
     if not 1 <= options.count <= library.MOST_OBJECTS:
-        raise BadArgumentsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
+        raise SettingsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
     _check_new(options.out)
     draw = shapes.draw_mixed if options.mixed else shapes.draw
     made = library.save(options.out, draw(options.seed, options.count)).objects
@@ -102,18 +96,17 @@ def _import(arguments: list[str]) -> int:
     options = parsing.parse(ImportOptions, arguments, "objects import")
     _check_new(options.out)
     if not (0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024):
-        raise BadArgumentsError("--scale must be positive, --jobs lie in 0 .. 1024")
+        raise SettingsError("--scale must be positive, --jobs lie in 0 .. 1024")
     from csac_jax.objects import body, conversion, importing, library
 
     least, most = body.DENSITIES
     if not least <= options.density <= most:
-        raise BadArgumentsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
+        raise SettingsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
-    with as_bad_arguments(ValueError):
-        paths = importing.files(list(options.paths))
+    paths = importing.files(list(options.paths))
     if len(paths) > library.MOST_OBJECTS:
-        raise BadArgumentsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
+        raise SettingsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
     jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
     settings = conversion.ImportSettings(options.scale, options.density)
     bar = output.progress()
@@ -143,7 +136,7 @@ def _import(arguments: list[str]) -> int:
 
 def _check_new(folder: Path) -> None:
     if folder.exists():
-        raise BadArgumentsError(f"--out: {folder} exists; give another name")
+        raise SettingsError(f"--out: {folder} exists; give another name")
 
 
 def _show(arguments: list[str]) -> int:
@@ -153,8 +146,7 @@ def _show(arguments: list[str]) -> int:
     if options.png is not None:
         from csac_jax.render import media
 
-        with as_bad_arguments(ValueError):
-            media.check_suffix(options.png, media.PICTURES)
+        media.check_suffix(options.png, media.PICTURES)
     objects = tables.find(options.library, "all").objects
     _list(objects)
     if options.png is not None:

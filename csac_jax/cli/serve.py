@@ -6,7 +6,8 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, check_extra
+from csac_jax.cli.failures import check_extra
+from csac_jax.errors import SettingsError
 
 LOCAL = ("127.0.0.1", "::1", "localhost")
 SHORTEST_TOKEN = 16  # characters
@@ -42,9 +43,9 @@ def run(arguments: list[str]) -> int:
         check_extra("serve", module, "serve")
     token = read_token(options)
     if not 0 <= options.port < 2**16:
-        raise BadArgumentsError("--port: must lie in 0 .. 65535")
+        raise SettingsError("--port: must lie in 0 .. 65535")
     if not all(16 <= side <= 4096 for side in options.size):
-        raise BadArgumentsError("--size: both numbers must lie in 16 .. 4096 px")
+        raise SettingsError("--size: both numbers must lie in 16 .. 4096 px")
     import uvicorn
 
     from csac_jax import deploy
@@ -60,18 +61,18 @@ def run(arguments: list[str]) -> int:
 
 
 def read_token(options: ServeOptions) -> str | None:
-    """Returns the token that clients must send, or None. Raises BadArgumentsError."""
+    """Returns the token that clients must send, or None. Raises SettingsError."""
     if options.token_file is None:
         if options.host not in LOCAL:
-            raise BadArgumentsError(
+            raise SettingsError(
                 f"--host {options.host}: others could use the service; give --token-file too"
             )
         return None
     if not options.token_file.is_file():
-        raise BadArgumentsError(f"--token-file: there is no file {options.token_file}")
+        raise SettingsError(f"--token-file: there is no file {options.token_file}")
     token = options.token_file.read_text().split("\n")[0].strip()
     if len(token) < SHORTEST_TOKEN or not token.isascii() or not token.isprintable():
-        raise BadArgumentsError(
+        raise SettingsError(
             f"--token-file: its first line must have {SHORTEST_TOKEN} printable characters or more"
         )
     return token

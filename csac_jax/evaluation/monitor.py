@@ -37,10 +37,10 @@ class EvalPlan(NamedTuple):
     episodes: int = EVAL_EPISODES  # of every part of the suite
 
     def check(self) -> None:
-        """Raises ValueError for numbers that cannot be, and for an unknown suite."""
+        """Raises SettingsError for numbers that cannot be, and for an unknown suite."""
         for name, value in (("eval_every", self.every), ("eval_episodes", self.episodes)):
             if value < 1:
-                raise ValueError(f"{name}: must be at least 1, not {value}")
+                raise SettingsError(f"{name}: must be at least 1, not {value}")
         suites.check(self.suite)
 
 
@@ -59,8 +59,8 @@ class Monitor(Callback):
         """Settles the scenes.
 
         Args: callback, whose `evaluated` is called; log, takes a line about each evaluation;
-        network and learner, of a run with custom parts. Raises ValueError for a suite that does not
-        fit the policy.
+        network and learner, of a run with custom parts. Raises SettingsError for a suite that does
+        not fit the policy.
         """
         self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
         self._cfg, self._plan, self._callback, self._log_line = cfg, plan, callback, log

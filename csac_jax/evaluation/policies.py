@@ -18,6 +18,7 @@ from csac_jax.agent.learner import Learner
 from csac_jax.baselines import antipodal, oracle
 from csac_jax.config import Config
 from csac_jax.env import State
+from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
@@ -227,13 +228,13 @@ def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
     """Makes the policy of a kind: `learned`, the networks of `source`; or a name of `BASELINES` or
     `MODULE:NAME`, a callable that makes a policy from the config of `source`, see `load`.
 
-    Raises ValueError for an unknown kind, and as `load`.
+    Raises SettingsError for an unknown kind, and as `load`.
     """
     if kind == "learned":
         return load(source, which=which)
     if kind not in BASELINES and ":" not in kind:
         known = ", ".join(("learned", *BASELINES))
-        raise ValueError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
+        raise SettingsError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
     build = BASELINES[kind] if kind in BASELINES else _imported(kind)
     policy: Policy = build(load_config(source, which))
     return policy
@@ -247,7 +248,7 @@ def _imported(path: str) -> Callable[[Config], Policy]:
             sys.path.insert(0, here)
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"policy: '{path}' cannot be imported ({error})") from None
+        raise SettingsError(f"policy: '{path}' cannot be imported ({error})") from None
 
 
 BASELINES: dict[str, Callable[[Config], Policy]] = {

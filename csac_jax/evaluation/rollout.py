@@ -48,7 +48,7 @@ def evaluate(
     Args: suite, a name of `suites.SUITES`, a case file, or a suite prepared by `suites.prepare`,
     which holds the other arguments; on_progress, called after every action; for the rest see
     `suites.prepare`. Returns: the metrics; of a suite with several parts {"parts": {name:
-    metrics}}. Raises ValueError as `suites.prepare`.
+    metrics}}. Raises SettingsError as `suites.prepare`.
     """
     if not isinstance(suite, PreparedSuite):
         learned = isinstance(policy, NetworkPolicy)

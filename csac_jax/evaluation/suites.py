@@ -43,6 +43,7 @@ from csac_jax.config import (
 )
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
+from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
 from csac_jax.scenes import arrange, cases, pool
 from csac_jax.sim import backend, physics as simulation
@@ -92,9 +93,9 @@ SUITES: dict[str, Suite] = {}
 def register(
     name: str, build: Build, episodes: int = 250, target: bool = False, objects: bool = False
 ) -> None:
-    """Adds a suite; see `Suite`. Raises ValueError for a name that is taken."""
+    """Adds a suite; see `Suite`. Raises SettingsError for a name that is taken."""
     if name in SUITES or name in RENAMED_SUITES:
-        raise ValueError(f"there is a suite '{name}' already; choose another name")
+        raise SettingsError(f"there is a suite '{name}' already; choose another name")
     SUITES[name] = Suite(build, episodes, target, objects)
 
 
@@ -113,9 +114,9 @@ def prepare(
 
     Args: suite, a name of `SUITES` or a case file; episodes, of every part; objects and split, the
     library of suites of objects, by default the config's; learned, False for a policy that needs no
-    training. Raises ValueError for an unknown suite, an unsound case file or one without the target
-    asked for, a library that is missing or not needed, and for a suite with targets where a learned
-    policy was trained without.
+    training. Raises SettingsError for an unknown suite, an unsound case file or one without the
+    target asked for, a library that is missing or not needed, and for a suite with targets where a
+    learned policy was trained without.
     """
     check(suite)
     suite = RENAMED_SUITES.get(suite, suite)
@@ -127,7 +128,7 @@ def prepare(
             suite, cfg, {Path(suite).stem: _case(cfg, Path(suite))}, episodes, seed
         )
     if SUITES[suite].target and learned and cfg.task.kind != "target":
-        raise ValueError(
+        raise SettingsError(
             f"suite: {suite} needs a policy trained with task.kind target, this one was trained to "
             "clear the table; choose another suite, or the policy oracle or random"
         )
@@ -137,21 +138,21 @@ def prepare(
 
 
 def check(suite: str) -> None:
-    """Raises ValueError for a name that is neither a suite's nor a file's."""
+    """Raises SettingsError for a name that is neither a suite's nor a file's."""
     if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
         known = ", ".join(SUITES)
-        raise ValueError(f"suite: '{suite}' is neither a case file nor one of: {known}")
+        raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
 
 
 def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
     if suite not in SUITES or not SUITES[suite].objects:
         if objects is not None:
             names = ", ".join(name for name, entry in SUITES.items() if entry.objects)
-            raise ValueError(f"objects: '{suite}' has no objects of a library; {names} have")
+            raise SettingsError(f"objects: '{suite}' has no objects of a library; {names} have")
         return cfg
     source = objects or cfg.scene.objects
     if not source:
-        raise ValueError(
+        raise SettingsError(
             f"objects: {suite} needs a library; csac-jax objects make --out LIB makes one, or "
             "give procedural:0:200"
         )

@@ -11,6 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
+from csac_jax.errors import SettingsError
 from csac_jax.objects import conversion, descriptions, library, solid
 from csac_jax.objects.body import Object
 from csac_jax.objects.conversion import ImportSettings
@@ -36,12 +37,12 @@ def files(paths: list[Path]) -> list[Path]:
     """Lists the importable files among these files and in these folders, sorted.
 
     Of a folder with URDF or MJCF only these are taken: its meshes are parts of them. Raises
-    ValueError for a path that is missing or has none.
+    SettingsError for a path that is missing or has none.
     """
     chosen: list[Path] = []
     for path in paths:
         if not path.exists():
-            raise ValueError(f"{path} does not exist")
+            raise SettingsError(f"{path} does not exist")
         inside = [file for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file()]
         described, meshes = (
             [file for file in inside if file.suffix.lower() in suffixes]
@@ -49,7 +50,7 @@ def files(paths: list[Path]) -> list[Path]:
         )
         if not described and not meshes:
             known = ", ".join((*MESHES, *descriptions.SUFFIXES))
-            raise ValueError(f"{path}: no mesh file; known are: {known}")
+            raise SettingsError(f"{path}: no mesh file; known are: {known}")
         chosen += sorted(described or meshes)
     return list(dict.fromkeys(chosen))
 

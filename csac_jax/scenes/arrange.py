@@ -13,6 +13,7 @@ import numpy as np
 
 from csac_jax import geometry
 from csac_jax.config import SceneConfig, SlotKind
+from csac_jax.errors import SettingsError
 from csac_jax.scenes import packings
 from csac_jax.scenes.packings import ROLES, Draws, Family, Role
 from csac_jax.world import blocks, scene_state
@@ -47,12 +48,12 @@ def arrange(key: jax.Array, cfg: SceneConfig, extent: float, level: jax.Array) -
     A higher `level` [] in 0..1 packs more blocks, closes the gaps between them from at most 40 mm
     to 1 mm, and adds loose blocks. Sizes, densities and frictions vary as in the pool. The target
     is the block that the others enclose. Fewer than `cfg.min_blocks` are in play if the square has
-    no room left. While tracing, raises SceneError for slots that allow none, ValueError for a
+    no room left. While tracing, raises SceneError for slots that allow none, SettingsError for a
     square too small.
     """
     least = 2.0 * (RADIUS + _MARGIN)
     if extent < least:
-        raise ValueError(
+        raise SettingsError(
             f"heightmap.extent: arrangements need at least {least:g} m, not {extent:g}"
         )
     possible = packings.available(cfg.slots).values()

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
+from csac_jax.errors import SettingsError
 from csac_jax.objects import tables
 from csac_jax.objects.library import LibraryError
 from csac_jax.world import blocks, object_slots, scene_state
@@ -42,16 +43,16 @@ def names() -> tuple[str, ...]:
 
 
 def shipped(name: str) -> Path:
-    """Returns the file of a shipped case. Raises ValueError with all names for an unknown one."""
+    """Returns the file of a shipped case. Raises SettingsError with all names for an unknown."""
     if name not in names():
-        raise ValueError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
+        raise SettingsError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
     return assets() / "cases" / f"{name}.json"
 
 
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
     """Loads a case whose blocks lie inside the square of side `extent` m.
 
-    Raises ValueError, one line with the file, the block (the first is 1) and what to change.
+    Raises SettingsError, one line with the file, the block (the first is 1) and what to change.
     """
     from csac_jax.scenes import case_file
 
@@ -59,18 +60,18 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
         case = _case(case_file.parse(path.read_text(encoding="utf-8")), path.parent)
         _check_places(case, extent)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, LibraryError) as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise SettingsError(f"{path}: {error}") from None
     except RecursionError:
-        raise ValueError(f"{path}: is nested too deeply for a case file") from None
+        raise SettingsError(f"{path}: is nested too deeply for a case file") from None
     return case
 
 
 def require_target(case: Case) -> None:
-    """Raises ValueError unless one block of the case is marked as the one to get."""
+    """Raises SettingsError unless one block of the case is marked as the one to get."""
     if case.scene.target == scene_state.ANY:
-        raise ValueError(f"case '{case.name}' marks no target; give one block \"target\": true")
+        raise SettingsError(f"case '{case.name}' marks no target; give one block \"target\": true")
 
 
 def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:

@@ -29,7 +29,7 @@ def measure(
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
 
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
-    ValueError as `suites.prepare` does, before anything is measured there.
+    SettingsError as `suites.prepare` does, before anything is measured there.
     """
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))

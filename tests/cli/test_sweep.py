@@ -14,6 +14,7 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import sweep as command
 from csac_jax.config import Config
 from csac_jax.evaluation import metrics
+from csac_jax.evaluation.suites import PreparedSuite
 from csac_jax.io import checkpoint, files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
@@ -142,7 +143,7 @@ def test_plan_survives_its_file(tmp_path: Path):
     content = json.loads(path.read_text())
     del content["sha256"]
     path.write_text(json.dumps({**content, "episodes": "7"}))
-    with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
+    with pytest.raises(runner.SweepError, match="episodes: 0 to"):
         command.read(["--resume", str(tmp_path)])
 
 
@@ -179,18 +180,19 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     stop = signals.Stop()
     monkeypatch.setattr(signals, "install", lambda: stop)
 
-    def measure(folder: Path, parts: dict, episodes: int, *_) -> dict:
-        assert (parts, episodes) == ({"packed": "packed" in str(folder)}, 4)
+    def measure(folder: Path, prepared: PreparedSuite) -> dict:
+        packed = prepared.cfg.scene.packed_fraction == 1.0
+        assert (packed, prepared.episodes) == ("packed" in str(folder), 4)
         measured.append(str(folder))
         stop.signal = 15 if len(measured) == 5 else None
         return metrics.summarise(_episodes(4 if "vpg" in str(folder) else 2 + int(folder.name[-1])))
 
-    def environments(cfg: Config, suite: str, *_) -> dict:
-        return {"packed": cfg.scene.packed_fraction == 1.0}
+    def prepare(cfg: Config, suite: str, episodes: int, seed: int, *_) -> PreparedSuite:
+        return PreparedSuite(suite, cfg, {}, episodes, seed)
 
     monkeypatch.setattr(final.policies, "load", lambda folder: folder)
-    monkeypatch.setattr(final.suites, "environments", environments)
-    monkeypatch.setattr(final.rollout, "measure", measure)
+    monkeypatch.setattr(final.suites, "prepare", prepare)
+    monkeypatch.setattr(final.rollout, "evaluate", measure)
     begun = cli.main(["sweep", "smoke", *STUDY.split(), "--evaluate", "4", "--run-dir", "run"])
     assert (begun, len(measured), Path("run/study.md").exists()) == (128 + 15, 5, False)
     stop.signal = None
@@ -220,8 +222,8 @@ def test_policies_are_measured_with_their_own_robot(
 ):
     """Claim: the final policies of a point are evaluated with the point's robot."""
     seen: list[str] = []
-    note = lambda cfg, *_: seen.append(cfg.sim.robot)  # noqa: E731
-    monkeypatch.setattr(final.suites, "environments", note)
+    note = lambda cfg, suite, episodes, seed, physics, robot: seen.append(robot)  # noqa: E731
+    monkeypatch.setattr(final.suites, "prepare", note)
     for robot in ("ur5", "hand"):
         point = SweepPoint(robot, {}, presets.smoke().change(sim={"robot": robot}))
         final._measure_point(4, final.OWN, point, tmp_path, [], signals.Stop())

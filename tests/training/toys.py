@@ -114,7 +114,7 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     pushes = [reward(0, jnp.int32(0), zero, gain, 0) for gain in gains]
     ex = cfg.explore
     chances = [
-        explore.probability(start, end, ex.decay, 100 * step)
+        explore.probability(start, end, ex.epsilon_decay, 100 * step)
         for start, end in (ex.epsilon_primitive, ex.epsilon_place)
     ]
     noisy = explore.action_noise(key_noise, ex, jnp.zeros(3))
