@@ -1,11 +1,7 @@
 """Every setting of a run, as frozen and hashable dataclasses.
 
-Lengths are metres, angles radians, times seconds unless a name says otherwise. A value out of range
-raises SettingsError with the setting's name. A section that holds traced values is not checked.
-Numbers marked (ours) are measured choices; the others name their source.
-
-A `ClassVar` is a constant: the same in every run, no setting. Alternatives are unions:
-`ReplayConfig` and `NetConfig`.
+Metres, radians and seconds unless a name says otherwise. Numbers marked (ours) are measured, the
+others name their source. A `ClassVar` is a constant, no setting.
 """
 
 import dataclasses
@@ -28,10 +24,8 @@ class SceneConfig(Section, section="scene"):
     """Blocks or objects on the table."""
 
     drop_height: ClassVar[float] = 0.15  # m, of the first drop (VPG); later ones start above it
-
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
-    """Kind of each slot. A box slot draws a cube, cuboid, plank or tile in every scene, an object
-    slot any object of the library."""
+    """Kind of each slot. A box slot draws a cube, cuboid, plank or tile in every scene."""
     objects: str = ""
     """Library that slots of kind object draw from: a folder; or shapes of this package,
     procedural:SEED:COUNT; or procedural+assemblies:SEED:COUNT with random assemblies among them."""
@@ -39,12 +33,9 @@ class SceneConfig(Section, section="scene"):
     """Objects of the library to draw: those for training, those kept for evaluation, or all."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
-    packed_fraction: float = number(
-        0.0, 0.0, 1.0
-    )  # Share of packed scenes; the others are dropped.
+    packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
     size_jitter: Pair = number((0.1, 0.1), 0.0, 0.25)
-    """Largest relative change of block sizes between scenes: boxes and arches, and the other kinds.
-    The latter are meshes: 0 where `sim.physics` is `warp`, which cannot scale them."""
+    """Largest relative change of sizes: boxes and arches; meshes, 0 where `sim.physics` is warp."""
     density: Pair = number((450.0, 900.0), 100.0, 3000.0)  # Densities, kg/m^3 (ours: woods).
     friction: Pair = number((0.5, 1.0), 0.1, 2.0)  # Range of sliding friction, blocks and table.
     drop_extent: Pair = number((0.248, 0.248), 0.05, 0.448)  # Side of a dropped pile, m (VPG).
@@ -72,7 +63,6 @@ class TaskConfig(Section, section="task"):
     """Goal and length of an episode."""
 
     max_steps_without_change: ClassVar[int] = 10  # actions without visible change that end it (VPG)
-
     kind: Literal["clear", "target"] = "clear"
     """`clear`: take every block (CSAC sec. 4.2). `target`: get one block, marked at random, then
     the next, and another scene when no block is left (sec. 4.3)."""
@@ -94,8 +84,7 @@ class SimConfig(Section, section="sim"):
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
     `warp` on one CUDA device where it is known to be faster, else `mjx`, or `c` for objects."""
-    robot: RobotKind = "hand"
-    """`hand`: the gripper alone, floating, for training. `ur5`, `ur5e`: on that arm."""
+    robot: RobotKind = "hand"  # The gripper alone, floating, for training; or on that arm.
     gripper: str | Gripper = "rg2"
     """`rg2`, `2f85`, `franka_hand`, or a folder with your own gripper.json and gripper.xml.
     `varied` has another opening and other fingers in every episode."""
@@ -129,10 +118,7 @@ class CameraConfig(Section, section="camera"):
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Centre of the level view, m.
 
     def scaled(self, share: float) -> "CameraConfig":
-        """Returns the same view with fewer pixels.
-
-        Raises SettingsError where the image would not have a whole number of pixels.
-        """
+        """Returns the same view with fewer pixels. Raises SettingsError unless they are whole."""
         size = (round(self.size[0] * share), round(self.size[1] * share))
         whole = math.dist(size, (self.size[0] * share, self.size[1] * share)) < 1e-6
         require(whole, f"camera: {share} of {self.size} px is not a whole number of pixels")
@@ -144,9 +130,8 @@ class CameraConfig(Section, section="camera"):
         image = f"an image of {self.size[0]} x {self.size[1]} px"
         for side, focal, centre in zip(self.size, self.focal, self.centre, strict=True):
             near = abs(centre - 0.5 * (side - 1)) <= 0.1 * side
-            remedy = "give the camera.size that the intrinsics belong to"
-            text = f"camera.centre: {self.centre} is not near the middle of {image}; {remedy}"
-            require(near, text)
+            off = f"camera.centre: {self.centre} is not near the middle of {image}"
+            require(near, f"{off}; give the camera.size that the intrinsics belong to")
             in_range = 0.3 <= focal / side <= 10.0
             require(in_range, f"camera.focal: not 0.3 to 10 times the sides of {image}")
         alike = abs(self.focal[0] / self.focal[1] - 1.0) <= 0.1
@@ -159,13 +144,11 @@ class SensorConfig(Section, section="sensor"):
     """Errors of a real depth camera: those of its `kind`, and the others added to them.
 
     Depth errors: sigma = floor + square d^2. Khoshelham and Elberink (Sensors 12, 2012, 1437-1454)
-    measured a square of 0.0014 for a structured-light camera. All but depths and dropped pixels are
-    drawn once a view; sigma is a standard deviation. Without any error nothing is drawn.
+    measured a square of 0.0014 for a structured-light camera. Sigma is a standard deviation. All
+    but depths and dropped pixels are drawn once a view.
     """
 
-    kind: SensorKind = "none"
-    """Camera whose depth images are imitated: noise, steps, holes and mixed pixels. The numbers
-    and their sources are in vision/depth_camera.py. It needs an oblique view."""
+    kind: SensorKind = "none"  # Camera to imitate, oblique view; see vision/depth_camera.py.
     depth_noise: Pair = number((0.0, 0.0), 0.0, 0.1)  # Floor, m, and square, 1/m, of depths.
     dropped: float = number(0.0, 0.0, 0.9)  # Probability that a pixel has no depth.
     pose_noise: Pair = number((0.0, 0.0), 0.0, 0.2)  # Sigma of position, m, and orientation, rad.
@@ -186,8 +169,7 @@ class HeightmapConfig(Section, section="heightmap"):
     size: int = number(64, 16)  # H = W, cells.
     extent: float = number(0.448, 0.1, 1.0)  # Side of the square workspace, m (VPG).
     view: Literal["ortho", "oblique"] = "ortho"
-    """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image, projected;
-    what blocks hide from it is empty (CSAC sec. 3.2, VPG)."""
+    """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image (VPG)."""
 
     @property
     def cell(self) -> float:
@@ -202,7 +184,6 @@ class _AnyNet(Section, section="net"):
     """Settings of every network."""
 
     dtype: ClassVar[str] = "auto"  # bfloat16 on accelerators, else float32, as are parameters
-
     rotations: int = number(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # See colours, not heights alone.
     pad_fraction: float = number(0.125, 0.0, 0.5)
@@ -228,9 +209,8 @@ class SmallNet(_AnyNet):
     def check_canvas(self, size: int) -> None:
         """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
         side = canvas_size(size, self.pad_fraction)
-        require(
-            side % 4 == 0, f"net.pad_fraction: rotated maps of {side} cells are not a multiple of 4"
-        )
+        fault = f"net.pad_fraction: rotated maps of {side} cells are not a multiple of 4"
+        require(side % 4 == 0, fault)
 
 
 class DenseNet121(_AnyNet):
@@ -245,9 +225,7 @@ class DenseNet121(_AnyNet):
     kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
-    upsample: int = number(
-        1, 1
-    )  # Pixels of the input per cell of the map, along each axis (VPG 2).
+    upsample: int = number(1, 1)  # Pixels of the input per cell of the map, each axis (VPG 2).
 
     def check(self) -> None:
         largest = self.STRIDE // self.output_stride
@@ -257,7 +235,7 @@ class DenseNet121(_AnyNet):
         """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
         side, step = canvas_size(size, self.pad_fraction), self.STRIDE // self.upsample
         first = -(-size // step) * step
-        sides = [s for s in (first, first + step, first + 2 * step) if s <= 1.5 * size]
+        sides = [s for s in range(first, first + 3 * step, step) if s <= 1.5 * size]
         fitting = ", ".join(f"{s / size - 1:.4f} ({s} cells)" for s in sides)
         remedy = f"try {fitting}" if fitting else f"take another heightmap.size than {size}"
         needs = f"DenseNet-121 needs maps of a multiple of {step} cells, not {side}"
@@ -282,8 +260,7 @@ class CEMConfig(Section, section="cem"):
     elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
     rounds: int = number(3, 1)  # Rounds of sampling and fitting.
     start: Literal["both", "actor", "cells"] = "both"
-    """Centre of the first round: the actor's mean, with the map's best cells among the samples; the
-    actor's mean alone; or the best cell, without the actor."""
+    """First round: the actor's mean and the best cells; its mean alone; the best cell alone."""
 
     def check(self) -> None:
         require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
@@ -292,22 +269,17 @@ class CEMConfig(Section, section="cem"):
 class PolicyConfig(Section, section="policy"):
     """Choice of an action from the dense maps."""
 
-    place: Literal["cem", "argmax"] = "cem"
-    """Place by the cross-entropy method, between cells and yaws; or the best cell (VPG)."""
+    place: Literal["cem", "argmax"] = "cem"  # By the cross-entropy method; or the best cell (VPG).
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
     """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
     action_mask: Literal["occupied", "none"] = "occupied"
-    """Cells where actions may begin: those with something to act on (SPOT); or all (CSAC), so that
-    a grasp may meet nothing, eq. 15's lowest level."""
+    """Cells where actions may begin: those with something to act on (SPOT); or all (CSAC)."""
     retry_temperature: float = number(0.0, 0.0, 10.0)
-    """Temperature, in units of Q, that each failed grasp in a row adds: the next place is drawn
-    about by Boltzmann's law, unless the policy explores. 0: the best place."""
+    """Temperature, in units of Q, that each failed grasp in a row adds to the draw of a place."""
     height_bonus: float = number(0.0, 0.0, 100.0)
-    """Q that each metre of the surface under a cell adds to the choice: what lies on top is taken
-    first, so that fewer objects fall from a pile. V(s) does not have it."""
+    """Q that each metre of the surface under a cell adds to the choice: what lies on top first."""
     augment: bool = False
-    """Without exploration, Q is the mean over mirror images of the view and over the critics
-    (test-time augmentation), at four times the networks' work."""
+    """Q is the mean over mirror images and critics, at four times the work, unless exploring."""
 
 
 class TargetConfig(Section, section="target"):
@@ -318,8 +290,7 @@ class TargetConfig(Section, section="target"):
     clip: ClassVar[float] = 0.5  # bound of that noise (SD3)
     samples: ClassVar[int] = 50  # noisy target actions per primitive in the softmax (SD3)
 
-    value: Literal["softmax", "max"] = "softmax"
-    """V(s'): softmax over noisy target actions (line 17), or the dense map's maximum (eq. 9)."""
+    value: Literal["softmax", "max"] = "softmax"  # V(s'): softmax (line 17) or maximum (eq. 9).
     gamma: float = number(0.5, 0.0, 1.0)  # Discount (VPG).
     bootstrap: Literal["episodic", "continuing"] = "episodic"
     """V(s') is 0 after the end of an episode; or, as in VPG's code, after an action that neither
@@ -360,18 +331,15 @@ class RewardConfig(Section, section="reward"):
         rising = list(self.grasp_levels) == sorted(self.grasp_levels)
         require(rising, "reward.grasp_levels: no level may be below the one before it")
         fits = self.outcome_source == "simulator" or self.lost_block_penalty == 0.0
-        name = "reward.lost_block_penalty"
-        require(
-            fits, f"{name}: must be 0 where reward.outcome_source is sensors, which cannot see it"
-        )
+        fault = "must be 0 where reward.outcome_source is sensors, which cannot see it"
+        require(fits, f"reward.lost_block_penalty: {fault}")
 
 
 class ExploreConfig(Section, section="explore"):
     """Exploration: action noise (Algorithm 1 line 13), random primitive, random place."""
 
     noise_std: float = number(0.01, 0.0)
-    """delta: standard deviation of the action noise, in CEM's units (ours: 0.03 spoils grasps). The
-    noise is clipped at three of them (c of line 13, ours)."""
+    """delta: sigma of the noise in CEM's units, clipped at 3 sigma (ours: 0.03 spoils grasps)."""
     epsilon_primitive: Pair = number((0.5, 0.1), 0.0, 1.0)  # Of a random primitive: from, to (VPG).
     epsilon_place: Pair = number((0.5, 0.0), 0.0, 1.0)  # The same of a random place (ours).
     epsilon_decay: float = number(0.998, 0.0, 1.0, above=True)
@@ -385,19 +353,15 @@ class LearnConfig(Section, section="learn"):
     gradient_clip: ClassVar[float] = 10.0  # bound of the gradient's global norm (ours)
     huber: ClassVar[float] = 1.0  # width of the quadratic part of the Huber loss (CSAC sec. 4)
 
-    learning_rate: float = number(1e-3, 0.0, above=True)
-    """Adam's step size, critic (ours; VPG 1e-4 on a pretrained DenseNet-121, CSAC gives none)."""
+    learning_rate: float = number(1e-3, 0.0, above=True)  # Adam's step size, critic (VPG 1e-4).
     actor_learning_rate: float = number(3e-4, 0.0, above=True)  # Adam's step size, actor (ours).
     lr_final_fraction: float = number(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
     batch: int = number(32, 1)  # B, transitions per update (N of Algorithm 1).
-    updates_per_step: int = number(
-        2, 1
-    )  # Critic updates per `train.scenes` actions; the actor has one.
+    updates_per_step: int = number(2, 1)  # Critic updates per step of all scenes; one of the actor.
     actor_batch: int = number(0, 0)  # Part of the last batch that the actor learns on; 0: all.
     augment: bool = True  # Show each drawn transition under a random symmetry of the square.
-    augment_shift: int = number(0, 0, 64)
-    """Largest shift of a drawn transition along each axis, cells; none that would cut it off."""
+    augment_shift: int = number(0, 0, 64)  # Largest shift of a drawn transition, cells.
     critics: Literal[1, 2] = 1  # Of two, each cell's lower Q counts (TD3's twin, arXiv:1802.09477).
     actor: bool = True  # Learn the policy network; without it, mu(s) is read off the critic's map.
     tau: float = number(0.02, 0.0, 1.0, above=True)
@@ -421,39 +385,29 @@ class UniformReplay(_AnyReplay):
 
 
 class PrioritisedReplay(_AnyReplay):
-    """CSAC-PER's replay: probability ~ (abs(TD error) + epsilon)^alpha, losses weighted against it
-    (Schaul et al., arXiv:1511.05952)."""
+    """CSAC-PER's: probability ~ (abs(TD error) + epsilon)^alpha, weighted (arXiv:1511.05952)."""
 
     is_beta: ClassVar[Pair] = (0.4, 1.0)  # exponent of the weights, linear from, to
     alpha: ClassVar[float] = 0.6  # 0 is uniform, 1 proportional to the priority (their sec. 4)
     per_epsilon: ClassVar[float] = 0.01  # so that no transition is out of reach (ours)
-
     sampler: Literal["prioritised"] = "prioritised"  # Others: uniform, beta, opposite.
 
 
 class BetaReplay(_AnyReplay):
-    """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5.
-
-    One law for the whole run: give start, middle and end the same. VPG's is (1, 2).
-    """
+    """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5."""
 
     middle_at: ClassVar[float] = 0.4  # share of all updates after which (a, b) is `middle` (ours)
-
-    sampler: Literal["beta"] = "beta"
-    """`uniform` (CSAC), `prioritised` (CSAC-PER), `beta` (CSAC-beta) or `opposite` (VPG)."""
-    rank_by: Literal["error", "reward"] = "error"
-    """Rank 0: the largest abs(TD error) (sec. 3.5) or reward (Algorithm 1 line 15)."""
+    sampler: Literal["beta"] = "beta"  # Others: uniform, prioritised, opposite.
+    rank_by: Literal["error", "reward"] = "error"  # Rank 0: largest abs(TD error), or reward.
     start: Pair = number((0.5, 0.5), 0.0, above=True)  # (a, b) at first (CSAC sec. 4.3).
     middle: Pair = number((1.0, 1.0), 0.0, above=True)  # (a, b) on the way (sec. 3.5: uniform).
     end: Pair = number((1.0, 12.0), 0.0, above=True)  # (a, b) in the end (CSAC sec. 4.3).
 
 
 class OppositeReplay(_AnyReplay):
-    """VPG's replay: with each of the newest transitions one of the same primitive whose outcome was
-    the opposite; its rank by abs(TD error) follows Beta(1, 2) (Zeng et al., code, `trainer.py`)."""
+    """VPG's replay: with each new transition one of its primitive with the opposite outcome."""
 
     law: ClassVar[Pair] = (1.0, 2.0)  # (a, b) of the ranks (Zeng et al., code)
-
     sampler: Literal["opposite"] = "opposite"  # Others: uniform, prioritised, beta.
 
 
@@ -507,8 +461,8 @@ class Config(Section):
     def change(self, **sections: Any) -> "Config":
         """Returns a config with other values: `cfg.change(seed=1, learn={"batch": 64})`.
 
-        A dict changes fields of a section, `{"sampler": "uniform"}` its alternative; settings that
-        both alternatives have are kept. Raises SettingsError for an unknown name or a bad value.
+        A dict with another `kind` or `sampler` takes that alternative, which keeps what both have.
+        Raises SettingsError for an unknown name or a bad value.
         """
         values = {name: _changed(getattr(self, name, None), new) for name, new in sections.items()}
         return _replaced(self, values)
@@ -518,13 +472,10 @@ class Config(Section):
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
         require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
         episodic = not self.reward.relabels or self.target.bootstrap == "episodic"
-        ending = "by which a transition ends in the scene that the push left"
-        needs = "renewed needs target.bootstrap episodic"
-        require(episodic, f"reward.push_label: {needs}, {ending}")
+        require(episodic, "reward.push_label: current_critic needs target.bootstrap episodic")
         batch, starts = self.learn.batch, self.train.learning_starts
         early = f"{batch} transitions cannot be drawn after train.learning_starts = {starts}"
-        remedy = "raise train.learning_starts or lower learn.batch"
-        require(batch <= starts, f"learn.batch: {early}; {remedy}")
+        require(batch <= starts, f"learn.batch: {early}; raise that or lower learn.batch")
         holds = max(self.train.scenes, batch) <= self.replay.capacity
         require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
         for name, off in (("pose_noise", 0), ("intrinsics_noise", 0), ("kind", "none")):
@@ -533,8 +484,8 @@ class Config(Section):
             require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
-        require(rotations % 2 == 0, "net.rotations: must be even")
-        require(rotations <= most, f"net.rotations: at most {most} for heightmap.size {size}")
+        fits = rotations % 2 == 0 and rotations <= most
+        require(fits, f"net.rotations: must be even, at most {most} for heightmap.size {size}")
         self.net.check_canvas(size)
         fits = not self.scene.has_objects or self.sim.physics != "mjx"
         require(fits, "sim.physics: objects that differ between scenes need c, warp or auto")

@@ -6,14 +6,9 @@ from csac_jax.algorithms import unknown
 from csac_jax.config import Config, SceneConfig
 from csac_jax.errors import SettingsError
 
+_SHAPES = ("arch", "prism", "box", "cylinder", "half_cylinder")
 TEN_BLOCKS = Config().change(
-    scene={
-        "slots": (
-            *("box", "box", "arch", "prism", "box"),
-            *("cylinder", "half_cylinder", "box", "box", "box"),
-        ),
-        "min_blocks": 10,
-    },
+    scene={"slots": ("box", "box", *_SHAPES, "box", "box", "box"), "min_blocks": 10},
     task={"max_actions": 25},
     sim={"geom_pairs": 24, "contacts": 80},
 )
@@ -28,9 +23,8 @@ PROTOCOL = TEN_BLOCKS.change(
 """The paper's sec. 4.3: a target named at random among ten blocks, a new one after each success,
 and another scene where none is left or the actions are spent; 2,500 actions in one scene at a time.
 
-C's physics are the fastest for one scene. The paper does not say after how many actions a scene is
-reset in training; 25 is ours. The current critic labels pushes (ours): early labels would stay
-"worse" otherwise.
+The paper does not say after how many actions a scene is reset in training; 25 is ours. The current
+critic labels pushes (ours): early labels would stay "worse" otherwise.
 """
 SMALL_NET = {
     "stride": 4,
@@ -40,6 +34,7 @@ SMALL_NET = {
     "growth": 32,
     "head": 48,
 }
+STRICT_REWARD = {"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0}
 
 
 def quick() -> Config:
@@ -48,9 +43,7 @@ def quick() -> Config:
     Blocks of one shape are alike in size, density and friction. Discount and the end of the Beta
     law are not the literature's; neither is shown to be needed. Two cores can afford few passes:
     the critic takes one large step for each step of all scenes, and exploration ends after some 500
-    actions. The actor learns on a part of the batch. The net's features lie 28 mm apart, not 14,
-    its maps' cells still 14; it has eight yaws, not sixteen. Greedy decisions are means over mirror
-    images. Costs: docs/benchmarks/speed-cpu.md.
+    actions. The actor learns on a part of the batch. Costs: docs/benchmarks/speed-cpu.md.
     """
     return Config().change(
         preset="quick",
@@ -73,28 +66,18 @@ def fast() -> Config:
     pushes, and blocks that leave cost. Physics is Warp's where it is installed, so meshes are of
     one size. Results: docs/benchmarks/learning-ablations.md.
     """
-    packed = {
-        "pool": 4096,
-        "packed_fraction": 0.75,
-        "drop_extent": (0.1, 0.25),
-        "size_jitter": (0.1, 0.0),
-    }
+    packed = {"packed_fraction": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
     length = {"actions": 655360, "learning_starts": 4096, "chunk": 2, "save_every": 20}
+    updates = {"batch": 64, "updates_per_step": 96, "augment_shift": 8}
     return TEN_BLOCKS.change(
         preset="fast",
-        scene=packed,
+        scene={"pool": 4096, **packed},
         sim={"physics": "auto"},
         net=SMALL_NET,
         target={"gamma": 0.2},
-        reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
+        reward=STRICT_REWARD,
         explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "epsilon_decay": 0.9998},
-        learn={
-            "batch": 64,
-            "updates_per_step": 96,
-            "augment_shift": 8,
-            "critics": 2,
-            "loss": "squared",
-        },
+        learn={**updates, "critics": 2, "loss": "squared"},
         replay={"capacity": 65536, "end": (1.0, 4.0)},
         train={"scenes": 4096, **length},
     )
@@ -107,21 +90,15 @@ def objects() -> Config:
     The tips go lower than for blocks, which low and hollow things need. The net is that of `quick`
     with wider layers, the rewards are those of `fast`.
     """
+    library = {"slots": ("object",) * 6, "min_blocks": 6, "objects": "procedural:1:700"}
+    looks = {"density": SceneConfig.density, "friction": SceneConfig.friction}
     return quick().change(
         preset="objects",
-        scene={
-            "slots": ("object",) * 6,
-            "min_blocks": 6,
-            "objects": "procedural:1:700",
-            "pool": 512,
-            "drop_extent": (0.1, 0.3),
-            "density": SceneConfig.density,
-            "friction": SceneConfig.friction,
-        },
+        scene={**library, **looks, "pool": 512, "drop_extent": (0.1, 0.3)},
         task={"max_actions": 20},
         sim={"clearance": 0.004, "contacts": 128},
         net={"growth": SMALL_NET["growth"]},
-        reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
+        reward=STRICT_REWARD,
         explore={"epsilon_decay": 0.9995},
         learn={"augment_shift": 8, "updates_per_step": 2, "learning_rate": 1e-3},
         replay={"capacity": 16384},
@@ -139,18 +116,15 @@ def grippers() -> Config:
 
     The net sees opening and fingers. It starts from a policy of blocks: `--init shipped`.
     """
+    random = {"epsilon_primitive": (0.2, 0.1), "epsilon_place": (0.2, 0.0)}
     return TEN_BLOCKS.change(
         preset="grippers",
         scene={"pool": 512, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)},
         sim={"physics": "auto", "gripper": "varied"},
         net=SMALL_NET | {"subpixel": 2, "gripper": True},
         target={"gamma": 0.2},
-        reward={"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0},
-        explore={
-            "epsilon_primitive": (0.2, 0.1),
-            "epsilon_place": (0.2, 0.0),
-            "epsilon_decay": 0.9995,
-        },
+        reward=STRICT_REWARD,
+        explore={**random, "epsilon_decay": 0.9995},
         learn={"actor_batch": 8, "augment_shift": 8, "updates_per_step": 1, "learning_rate": 5e-4},
         replay={"capacity": 16384, "end": (1.0, 4.0)},
         train={"actions": 6080, "learning_starts": 128, "chunk": 20, "save_every": 10},
@@ -170,16 +144,11 @@ def paper() -> Config:
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
     updates = {"batch": 2, "actor_batch": 1, "updates_per_step": 1, "augment": False, "tau": 0.005}
+    net = {"kind": "densenet121", "norm": "batch", "head": 64, "pad_fraction": 0.4286}
     return PROTOCOL.change(
         preset="paper",
         heightmap={"size": 224},
-        net={
-            "kind": "densenet121",
-            "norm": "batch",
-            "head": 64,
-            "pad_fraction": 0.4286,
-            "upsample": 2,
-        },
+        net={**net, "upsample": 2},
         target={"gamma": 0.5},
         explore={"epsilon_place": (0.0, 0.0), "epsilon_decay": 0.9998, "push_fraction": 0.5},
         learn={**rates, **updates},

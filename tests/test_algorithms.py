@@ -41,9 +41,9 @@ def test_sizes_stay_the_presets(name):
     before, after = presets.quick(), algorithms.configure(presets.quick(), name)
     for section in ("scene", "sim", "heightmap", "net", "cem", "train"):
         assert getattr(before, section) == getattr(after, section)
-    for field in ("batch", "updates", "learning_rate", "lr_final_fraction", "augment"):
+    for field in ("batch", "updates_per_step", "learning_rate", "lr_final_fraction", "augment"):
         assert getattr(before.learn, field) == getattr(after.learn, field)
-    for field in ("epsilon_place", "decay"):
+    for field in ("epsilon_place", "epsilon_decay"):
         assert getattr(before.explore, field) == getattr(after.explore, field)
     assert before.replay.capacity == after.replay.capacity
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from csac_jax.agent import box
 from csac_jax.config import CEMConfig
+from csac_jax.errors import SettingsError
 
 Score = Callable[[jax.Array], jax.Array]  # of a point of the box [3] -> []
 
@@ -39,7 +40,7 @@ def maximise(
     Args: mean [3] the actor's proposal; start [P0, 3] first samples of the first round, P0 <= J.
     """
     if len(start) > cfg.candidates:
-        raise ValueError(f"cem.candidates: must be at least {len(start)}, the starting points")
+        raise SettingsError(f"cem.candidates: must be at least {len(start)}, the starting points")
     centre = box.project(mean)
     nothing = CEMResult(centre, jnp.full((), -jnp.inf, mean.dtype), centre[None])
     search = _Search(centre, jnp.full_like(mean, cfg.std), nothing)

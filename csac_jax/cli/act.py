@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import as_bad_arguments
 from csac_jax.cli.robot_options import RobotOptions
 from csac_jax.errors import FailedError
 from csac_jax.section import require
@@ -43,8 +42,7 @@ def run(arguments: list[str]) -> int:
     if options.png is not None:
         from csac_jax.render import media
 
-        with as_bad_arguments(ValueError):
-            media.check_suffix(options.png, media.PICTURES)
+        media.check_suffix(options.png, media.PICTURES)
     from csac_jax.deploy import image_files
 
     policy = options.load()

@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from csac_jax.cli import output, settings
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
+from csac_jax.cli.failures import check_seed
+from csac_jax.errors import SettingsError
 from csac_jax.io import files
 from csac_jax.runtime import processes, signals
 
@@ -84,7 +85,7 @@ def run(arguments: list[str]) -> int:
     if options.out is not None:
         return _measure_all(options, changes)
     (suite,) = options.suites
-    with output.progress() as bars, as_bad_arguments(ValueError):
+    with output.progress() as bars:
         result = _measure(_shown(bars), options, changes, suite, options.episodes or EPISODES)
     for part, summary in result.get("parts", {Path(suite).stem: result}).items():
         title = (
@@ -98,23 +99,23 @@ def run(arguments: list[str]) -> int:
 
 def _check(options: EvalOptions) -> None:
     if options.episodes is not None and options.episodes < 1:
-        raise BadArgumentsError("--episodes: at least 1")
+        raise SettingsError("--episodes: at least 1")
     if not 0.0 < options.share <= 1.0:
-        raise BadArgumentsError("--share: above 0, at most 1")
+        raise SettingsError("--share: above 0, at most 1")
     if not 0 <= options.jobs <= 1024:
-        raise BadArgumentsError("--jobs: must lie in 0 .. 1024")
+        raise SettingsError("--jobs: must lie in 0 .. 1024")
     check_seed(options.seed)
     _which(options.which)
     if options.out is None and (len(options.suites) != 1 or "all" in options.suites):
-        raise BadArgumentsError("--suites: several need --out DIR")
+        raise SettingsError("--suites: several need --out DIR")
     if options.out is not None and options.json is not None:
-        raise BadArgumentsError("--json: is for a single suite; --out writes a file for each")
+        raise SettingsError("--json: is for a single suite; --out writes a file for each")
 
 
 def _which(text: str) -> Any:
     """Reads `best`, `last`, or the number of a step."""
     if text not in ("best", "last") and not text.isdecimal():
-        raise BadArgumentsError(f"--which: '{text}' is neither best, last nor a step")
+        raise SettingsError(f"--which: '{text}' is neither best, last nor a step")
     return text if text in ("best", "last") else int(text)
 
 
@@ -123,14 +124,13 @@ def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
     fields = dataclasses.fields(EvalOptions)
     changed = {field.name for field in fields if getattr(options, field.name) != field.default}
     if changed - {"source", "suites", "episodes"} or any(view.values()):
-        raise BadArgumentsError(
+        raise SettingsError(
             "eval SWEEP: takes --suite and --episodes alone; give one of its runs for other options"
         )
     from csac_jax import api
 
     stop, episodes = signals.install(), options.episodes or EPISODES
-    with as_bad_arguments(ValueError):
-        stopped = api.evaluate_sweep(Path(options.source), options.suites[0], episodes, stop)
+    stopped = api.evaluate_sweep(Path(options.source), options.suites[0], episodes, stop)
     return 0 if stopped is None else 128 + stopped
 
 
@@ -193,13 +193,12 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any]) -> int:
 
     assert options.out is not None
     if options.out.exists() and not options.out.is_dir():
-        raise BadArgumentsError(f"--out: {options.out} is a file; give a folder")
+        raise SettingsError(f"--out: {options.out} is a file; give a folder")
     options.out.mkdir(parents=True, exist_ok=True)  # before hours of work
-    with as_bad_arguments(ValueError):
-        policy, cfg = _policy(options, changes)
-        chosen = _fitting(options, cfg) if "all" in options.suites else options.suites
-        for suite in chosen:
-            suites.check(suite)
+    policy, cfg = _policy(options, changes)
+    chosen = _fitting(options, cfg) if "all" in options.suites else options.suites
+    for suite in chosen:
+        suites.check(suite)
     tag = _digest(options, policy, changes)
     numbers = {suite: options.episodes or _episodes(options, suite) for suite in chosen}
     paths = {suite: options.out / f"{Path(suite).stem}.json" for suite in chosen}
@@ -214,7 +213,7 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any]) -> int:
         print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
 
     tasks = [(options, changes, suite, numbers[suite]) for suite in waiting]
-    with output.progress() as bars, as_bad_arguments(ValueError):
+    with output.progress() as bars:
         jobs = options.jobs or processes.cores()
         processes.each(_measure, tasks, jobs, _shown(bars), on_done)
     print(_write_table(options.out, paths), end="")

@@ -1,26 +1,13 @@
 """Errors of a command: one line on stderr and an exit code; checks that several commands share."""
 
-import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 from csac_jax import grippers
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-
-BadArgumentsError = SettingsError
-
-
-@contextlib.contextmanager
-def as_bad_arguments(*kinds: type[Exception]) -> Iterator[None]:
-    """Turns errors of these kinds in the block into SettingsErrors with the same message."""
-    try:
-        yield
-    except kinds as error:
-        raise SettingsError(str(error)) from None
 
 
 def complain(code: int, error: object) -> int:

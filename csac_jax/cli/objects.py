@@ -10,7 +10,7 @@ import tyro
 
 from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
-from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
+from csac_jax.cli.failures import check_extra, check_seed
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.runtime import processes
@@ -104,8 +104,7 @@ def _import(arguments: list[str]) -> int:
         raise SettingsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
-    with as_bad_arguments(ValueError):
-        paths = importing.files(list(options.paths))
+    paths = importing.files(list(options.paths))
     if len(paths) > library.MOST_OBJECTS:
         raise SettingsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
     jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
@@ -144,8 +143,7 @@ def _show(arguments: list[str]) -> int:
     if options.png is not None:
         from csac_jax.render import media
 
-        with as_bad_arguments(ValueError):
-            media.check_suffix(options.png, media.PICTURES)
+        media.check_suffix(options.png, media.PICTURES)
     objects = tables.find(options.library, "all").objects
     _list(objects)
     if options.png is not None:

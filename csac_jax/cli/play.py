@@ -9,7 +9,8 @@ import tyro
 
 from csac_jax import presets
 from csac_jax.cli import output, settings
-from csac_jax.cli.failures import as_bad_arguments, check_extra, check_seed
+from csac_jax.cli.failures import check_extra, check_seed
+from csac_jax.errors import SettingsError
 from csac_jax.render import gl
 
 
@@ -81,11 +82,10 @@ def run(arguments: list[str]) -> int:
     return 0
 
 
-@as_bad_arguments(ValueError)
 def _check(options: PlayOptions) -> None:
     check_seed(options.seed)
     if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
-        raise ValueError("--size: both numbers must be even and lie in 16 .. 4096 px")
+        raise SettingsError("--size: both numbers must be even and lie in 16 .. 4096 px")
     if options.viewer and not gl.has_display():
         check_extra("--viewer: there is no display here, and its page", "viser", "viewer")
     if options.png is None and options.video is None:
@@ -118,18 +118,17 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     from csac_jax.runtime import cache
 
     cache.enable()
-    with as_bad_arguments(ValueError):
-        suite = _suite(options.scene)
-        prepared = suites.prepare(
-            policy.cfg.change(**view),
-            suite,
-            1,
-            options.seed,
-            options.physics,
-            options.robot,
-            options.objects,
-            "all",
-        )
+    suite = _suite(options.scene)
+    prepared = suites.prepare(
+        policy.cfg.change(**view),
+        suite,
+        1,
+        options.seed,
+        options.physics,
+        options.robot,
+        options.objects,
+        "all",
+    )
     (env,) = prepared.parts.values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
@@ -141,7 +140,7 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
 
 def _suite(scene: str) -> str:
-    """Returns the suite of one part with these scenes. Raises ValueError if there is none."""
+    """Returns the suite of one part with these scenes. Raises SettingsError if there is none."""
     from csac_jax.evaluation import suites
     from csac_jax.scenes import cases
 
@@ -155,4 +154,4 @@ def _suite(scene: str) -> str:
     if Path(scene).is_file():
         return scene
     known = ", ".join(("random", *cases.names(), *stocked))
-    raise ValueError(f"--scene: '{scene}' is neither a case file nor one of: {known}")
+    raise SettingsError(f"--scene: '{scene}' is neither a case file nor one of: {known}")

@@ -6,9 +6,9 @@ from pathlib import Path
 import tyro
 
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_extra
+from csac_jax.cli.failures import check_extra
 from csac_jax.cli.parsing import PROGRAM
-from csac_jax.errors import FailedError
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import files
 
 
@@ -34,19 +34,15 @@ def run(arguments: list[str]) -> int:
     """Prints the tables and writes the files that were asked for; returns the exit code."""
     options = parsing.parse(ReportOptions, arguments, "report")
     if not options.runs:
-        raise BadArgumentsError(
-            "report: give at least one folder of a run or file of `eval --json`"
-        )
+        raise SettingsError("report: give at least one folder of a run or file of `eval --json`")
     if options.out is not None:
         check_extra("--out", "jinja2", "report")
     from csac_jax.report import comparison, result_tables, results
 
-    with as_bad_arguments(ValueError):
-        recorded = results.read(options.runs)
+    recorded = results.read(options.runs)
     if not (recorded.runs or recorded.evaluations):
         raise FailedError("; ".join(recorded.notes))
-    with as_bad_arguments(ValueError):
-        report = comparison.build(recorded, options.reference)
+    report = comparison.build(recorded, options.reference)
     text = result_tables.markdown(report)
     print(text, end="")
     if options.markdown is not None:

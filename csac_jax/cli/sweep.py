@@ -9,7 +9,6 @@ import tyro
 
 from csac_jax import presets
 from csac_jax.cli import failures, output, settings
-from csac_jax.cli.failures import as_bad_arguments
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
@@ -156,13 +155,11 @@ def _join(options: SweepOptions) -> None:
         )
     from csac_jax.runtime import cluster
 
-    with as_bad_arguments(ValueError):
-        cluster.join(*place)
+    cluster.join(*place)
 
 
 def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> Any:
-    with as_bad_arguments(ValueError):
-        points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
+    points = grid.points(options.vary, lambda own: _parse(preset, [*flags, *own])[1])
     from csac_jax.sim import backend  # with JAX, so after those errors
     from csac_jax.sweeps import runner
 
@@ -171,9 +168,8 @@ def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> An
     for point in points:
         failures.check_physics(point.cfg, devices)
     plan = runner.SweepPlan(options.seeds, points, options.evaluate)
-    with as_bad_arguments(runner.SweepError, ValueError):
-        runner.check_plan(plan)
-        runner.groups_of(plan._replace(seeds=1))
+    runner.check_plan(plan)
+    runner.groups_of(plan._replace(seeds=1))
     return plan
 
 

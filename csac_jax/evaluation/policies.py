@@ -17,6 +17,7 @@ from csac_jax.agent.learner import Learner
 from csac_jax.baselines import antipodal, oracle
 from csac_jax.config import Config
 from csac_jax.env import State
+from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
@@ -214,13 +215,13 @@ def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
 
 def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
     """Makes the policy of a kind: `learned`, the networks of `source`, see `load`; or a name of
-    `BASELINES` or `MODULE:NAME`, a callable that takes the config of `source`. Raises ValueError
+    `BASELINES` or `MODULE:NAME`, a callable that takes the config of `source`. Raises SettingsError
     for an unknown kind."""
     if kind == "learned":
         return load(source, which=which)
     if kind not in BASELINES and ":" not in kind:
         known = ", ".join(("learned", *BASELINES))
-        raise ValueError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
+        raise SettingsError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
     build = BASELINES[kind] if kind in BASELINES else _imported(kind)
     return build(load_config(source, which))
 
@@ -233,7 +234,7 @@ def _imported(path: str) -> Callable[[Config], Policy]:
             sys.path.insert(0, here)
         return getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"policy: '{path}' cannot be imported ({error})") from None
+        raise SettingsError(f"policy: '{path}' cannot be imported ({error})") from None
 
 
 BASELINES: dict[str, Callable[[Config], Policy]] = {

@@ -44,7 +44,7 @@ def evaluate(
 
     Args: suite, a name of `suites.SUITES`, a case file, or a suite prepared by `suites.prepare`,
     which has the other arguments; on_progress, called after every action. Returns: the metrics; of
-    a suite with several parts {"parts": {name: metrics}}. Raises ValueError as `suites.prepare`.
+    a suite with several parts {"parts": {name: metrics}}. Raises SettingsError as `suites.prepare`.
     """
     if not isinstance(suite, suites.PreparedSuite):
         learned = isinstance(policy, NetworkPolicy)

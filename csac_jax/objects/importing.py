@@ -11,6 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 
+from csac_jax.errors import SettingsError
 from csac_jax.objects import conversion, descriptions, library, solid
 from csac_jax.objects.body import Object
 from csac_jax.objects.conversion import ImportSettings
@@ -27,20 +28,20 @@ Converted = tuple[Object, float]  # with the volume of its parts / volume of the
 def files(paths: list[Path]) -> list[Path]:
     """Lists the importable files among these files and in these folders, sorted.
 
-    The meshes in a folder with URDF or MJCF are parts of these. Raises ValueError for a path that
-    is missing or has none.
+    The meshes in a folder with URDF or MJCF are parts of these. Raises SettingsError for a path
+    that is missing or has none.
     """
     chosen: list[Path] = []
     for path in paths:
         if not path.exists():
-            raise ValueError(f"{path} does not exist")
+            raise SettingsError(f"{path} does not exist")
         inside = [file for file in (path.rglob("*") if path.is_dir() else [path]) if file.is_file()]
         for suffixes in (descriptions.SUFFIXES, MESHES):
             if files := sorted(file for file in inside if file.suffix.lower() in suffixes):
                 break
         else:
             known = ", ".join((*MESHES, *descriptions.SUFFIXES))
-            raise ValueError(f"{path}: no mesh file; known are: {known}")
+            raise SettingsError(f"{path}: no mesh file; known are: {known}")
         chosen += files
     return list(dict.fromkeys(chosen))
 

@@ -8,6 +8,8 @@ from typing import Any
 import imageio.v2 as imageio
 import numpy as np
 
+from csac_jax.errors import SettingsError
+
 FRAMES_PER_SECOND = 25
 FILMS = (".mp4", ".mkv", ".mov")  # by ffmpeg
 VIDEOS = (*FILMS, ".gif", ".webp")
@@ -15,9 +17,9 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".gif")
 
 
 def check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
-    """Raises ValueError for any other suffix."""
+    """Raises SettingsError for any other suffix."""
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}: its name must end in one of: {', '.join(suffixes)}")
+        raise SettingsError(f"{path}: its name must end in one of: {', '.join(suffixes)}")
 
 
 def needs_ffmpeg(path: Path) -> bool:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from csac_jax.errors import SettingsError
+
 LARGEST = 1e28  # larger priorities are cut off here, so that the sum over any ring is finite
 
 
@@ -40,7 +42,7 @@ def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
     """
     capacity, num = state.priority.shape[0], valid.shape[0]
     if num > capacity:
-        raise ValueError(f"replay.capacity: must be at least {num}, the transitions of a step")
+        raise SettingsError(f"replay.capacity: must be at least {num}, the transitions of a step")
     position = jnp.cumsum(valid, dtype=jnp.int32)  # [E], 1 for the first valid item
     count = position[-1]
     outside = capacity + jnp.arange(num, dtype=jnp.int32)  # dropped

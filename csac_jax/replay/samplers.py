@@ -119,8 +119,8 @@ def _ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Arr
     """Sorts slots [C] by falling value, filled ones first; also returns their number [].
 
     Equal values share their ranks at random: by slot, the oldest would be preferred. Of a ring of
-    more than SORTED slots, CANDIDATES random ones are sorted. The rank among all then deviates by at
-    most n / (2 sqrt(CANDIDATES)): no decile's share changes by 0.001.
+    more than SORTED slots, CANDIDATES random ones are sorted. The rank among all then deviates by
+    at most n / (2 sqrt(CANDIDATES)): no decile's share changes by 0.001.
     """
     if values.shape[0] > SORTED:
         some = jax.random.randint(key, (CANDIDATES,), 0, jnp.maximum(size, 1), jnp.int32)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac_jax.errors import SettingsError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import variants
@@ -142,7 +143,7 @@ class ResultReport(NamedTuple):
 def build(results: Results, reference: str | None = None) -> ResultReport:
     """Groups runs and evaluations over their seeds.
 
-    Raises ValueError for a reference that has no run and no evaluation.
+    Raises SettingsError for a reference that has no run and no evaluation.
     """
     curves = [Curve(*group) for group in grouped(results.runs, lambda run: run.variant).items()]
     scores = [
@@ -151,7 +152,9 @@ def build(results: Results, reference: str | None = None) -> ResultReport:
     ]
     algorithms = sorted({one.variant.algo for one in (*curves, *scores)})
     if reference is not None and reference not in algorithms:
-        raise ValueError(f"no result of {reference}; there are: {', '.join(algorithms) or 'none'}")
+        raise SettingsError(
+            f"no result of {reference}; there are: {', '.join(algorithms) or 'none'}"
+        )
     notes = [*results.notes, *(note for curve in curves for note in _curve_notes(curve))]
     return ResultReport(curves, scores, results, notes, reference or REFERENCE)
 

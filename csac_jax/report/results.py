@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax.config import shown
+from csac_jax.errors import SettingsError
 from csac_jax.io import files, renames
 from csac_jax.report import variants
 from csac_jax.report.variants import Json, Variant
@@ -96,7 +97,7 @@ class Results(NamedTuple):
 def read(paths: Iterable[Path]) -> Results:
     """Reads folders, files and archives; of a folder also the archives that lie directly in it.
 
-    Raises ValueError for a path that is none of them.
+    Raises SettingsError for a path that is none of them.
     """
     results = Results([], [], [])
     for path in paths:
@@ -125,7 +126,9 @@ def _opened(path: Path) -> Iterator[Path]:
                 for member in archive:
                     _unpack(archive, member, folder)
         except (OSError, EOFError, tarfile.TarError, lzma.LZMAError) as error:
-            raise ValueError(f"{path} is no archive of runs ({files.first_line(error)})") from None
+            raise SettingsError(
+                f"{path} is no archive of runs ({files.first_line(error)})"
+            ) from None
         yield folder
 
 
@@ -140,7 +143,9 @@ def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> 
 
 def _files(path: Path) -> Iterator[Path]:
     if not path.exists():
-        raise ValueError(f"there is no file or folder {path}; give folders of runs or eval results")
+        raise SettingsError(
+            f"there is no file or folder {path}; give folders of runs or eval results"
+        )
     if path.is_file():
         yield path
     for folder, names, contents in os.walk(path):

@@ -13,6 +13,7 @@ from jax import Array
 
 from csac_jax import geometry
 from csac_jax.config import SceneConfig, SlotKind
+from csac_jax.errors import SettingsError
 from csac_jax.scenes import packings
 from csac_jax.scenes.packings import ROLES, Draws, Family, Role
 from csac_jax.world import blocks, scene_state
@@ -45,11 +46,11 @@ def arrange(key: Array, cfg: SceneConfig, extent: float, level: Array) -> SceneS
 
     A higher `level` [] in 0..1 packs more blocks, closer, and adds loose ones. The target is the
     block that the others enclose. Fewer than `cfg.min_blocks` are in play if there is no room.
-    While tracing, raises SceneError for slots that allow none, ValueError for a small square.
+    While tracing, raises SceneError for slots that allow none, SettingsError for a small square.
     """
     least = 2.0 * (RADIUS + _MARGIN)
     if extent < least:
-        raise ValueError(f"heightmap.extent: packing needs at least {least:g} m, not {extent:g}")
+        raise SettingsError(f"heightmap.extent: packing needs at least {least:g} m, not {extent:g}")
     possible = packings.available(cfg.slots).values()
     key_sizes, key_family, key_pack, key_place, key_loose, key_looks = jax.random.split(key, 6)
     sizes = draw_sizes(key_sizes, cfg)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
+from csac_jax.errors import SettingsError
 from csac_jax.objects import tables
 from csac_jax.objects.library import LibraryError
 from csac_jax.world import blocks, object_slots, scene_state
@@ -39,14 +40,14 @@ def names() -> tuple[str, ...]:
 
 
 def shipped(name: str) -> Path:
-    """Returns the file of a shipped case. Raises ValueError with all names for an unknown one."""
+    """Returns the file of a shipped case. Raises SettingsError with all names for an unknown."""
     if name not in names():
-        raise ValueError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
+        raise SettingsError(f"unknown case '{name}'; choose one of: {', '.join(names())}")
     return assets() / "cases" / f"{name}.json"
 
 
 def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
-    """Loads a case whose blocks lie inside the square of side `extent` m. Raises ValueError, one
+    """Loads a case whose blocks lie inside the square of side `extent` m. Raises SettingsError, one
     line with the file, the block (the first is 1) and what to change."""
     from csac_jax.scenes import case_file
 
@@ -54,16 +55,16 @@ def load(path: Path, extent: float = HeightmapConfig.extent) -> Case:
         case = _case(case_file.parse(path.read_text(encoding="utf-8")), path.parent)
         _check_places(case, extent)
     except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from None
+        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, LibraryError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise SettingsError(f"{path}: {error}") from None
     return case
 
 
 def require_target(case: Case) -> None:
-    """Raises ValueError unless one block of the case is marked as the one to get."""
+    """Raises SettingsError unless one block of the case is marked as the one to get."""
     if case.scene.target == scene_state.ANY:
-        raise ValueError(f"case '{case.name}' marks no target; give one block \"target\": true")
+        raise SettingsError(f"case '{case.name}' marks no target; give one block \"target\": true")
 
 
 def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:
@@ -86,7 +87,7 @@ def _case(content: "CaseFile", folder: Path) -> Case:
     targets = [slot for slot, entry in enumerate(entries) if entry.target]
     if len(targets) > 1:
         first, second = targets[0] + 1, targets[1] + 1
-        raise ValueError(f"block {second}: block {first} is the target already; mark only one")
+        raise SettingsError(f"block {second}: block {first} is the target already; mark only one")
     unknown = blocks.Shape("object", blocks.OBJECT_HALF)
     shapes = [blocks.SHAPES[entry.shape] if entry.shape else unknown for entry in entries]
     slots = tuple(shape.kind for shape in shapes)
@@ -106,7 +107,7 @@ def _case(content: "CaseFile", folder: Path) -> Case:
 def _with_objects(case: Case, entries: list["CaseBlock"], folder: Path) -> Case:
     name, *others = {entry.library for entry in entries if entry.library}
     if others:
-        raise ValueError(f"objects of {1 + len(others)} libraries; take all from one")
+        raise SettingsError(f"objects of {1 + len(others)} libraries; take all from one")
     source = name if tables.PROCEDURAL.fullmatch(name) else str(folder / name)
     library, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
     numbers = np.array([library.number(entries[slot].object or "") for slot in slots])
@@ -124,7 +125,7 @@ def _check_places(case: Case, extent: float) -> None:
     for number, parts in enumerate(_corners(case), 1):
         fault = _outside(np.concatenate(parts), extent) or _overlapping(parts, placed)
         if fault:
-            raise ValueError(f"block {number}: {fault}")
+            raise SettingsError(f"block {number}: {fault}")
         placed.append(parts)
 
 

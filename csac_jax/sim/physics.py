@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from csac_jax.config import Config, SimConfig
+from csac_jax.errors import SettingsError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action, JointTrajectory, Plan
 from csac_jax.sim import c_physics, warp_physics
@@ -39,10 +40,10 @@ PHYSICS: dict[str, Callable[[World, SimConfig], Physics]] = {
 
 
 def make(world: World, cfg: SimConfig) -> Physics:
-    """Makes the engine that the config names. Raises ValueError for `auto`, see `sim.backend`."""
+    """Makes the engine that the config names. Raises SettingsError for `auto`."""
     if cfg.physics not in PHYSICS:
         engines = ", ".join(PHYSICS)
-        raise ValueError(f"sim.physics: {cfg.physics!r} is no engine; choose one of: {engines}")
+        raise SettingsError(f"sim.physics: {cfg.physics!r} is no engine; choose one of: {engines}")
     return PHYSICS[cfg.physics](world, cfg)
 
 

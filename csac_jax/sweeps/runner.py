@@ -187,10 +187,10 @@ def runs_of(plan: SweepPlan) -> list[SweepRun]:
 
 
 def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
-    """Groups the runs of a plan, in order. Raises SweepError if points are equal."""
+    """Groups the runs of a plan, in order. Raises SettingsError if points are equal."""
     runs = {run.cfg: run for run in runs_of(plan)}
     if len(runs) < plan.seeds * len(plan.points):
-        raise SweepError("vary: two settings have the same values; leave one of them out")
+        raise SettingsError("vary: two settings have the same values; leave one of them out")
     return [(group, [runs[cfg] for cfg in group.configs]) for group in group_configs(list(runs))]
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from csac_jax.cli import settings
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import provenance
 
 
@@ -17,7 +17,7 @@ class Parser(argparse.ArgumentParser):
     """Complains in one line, as the rest of the command line does."""
 
     def error(self, message: str) -> NoReturn:
-        raise BadArgumentsError(f"{self.prog}: {message}")
+        raise SettingsError(f"{self.prog}: {message}")
 
 
 def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
@@ -67,8 +67,8 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
     """Builds the config of a preset with settings as `train` takes them."""
     try:
         return settings.parse(_Run, f"bench {name}", settings.base(preset, flags), flags)[1]
-    except BadArgumentsError as error:
-        raise BadArgumentsError(f"bench {name}: {error}") from None
+    except SettingsError as error:
+        raise SettingsError(f"bench {name}: {error}") from None
 
 
 def with_blocks(cfg: Config, num: int) -> Config:

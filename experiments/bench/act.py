@@ -19,8 +19,8 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.agent import actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, DenseNet121, HeightmapConfig, NetConfig, SmallNet
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import compiler
 from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
@@ -52,7 +52,7 @@ def _densenet(pixels: int, upsample: int) -> Config:
         )
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:
-        raise BadArgumentsError(f"bench act: {error}") from None
+        raise SettingsError(f"bench act: {error}") from None
 
 
 def _random(tree: Any) -> Any:

@@ -9,7 +9,8 @@ action without change. EPISODES of each (100); the robot is out of the camera's 
 
 import time
 
-from csac_jax.cli.failures import BadArgumentsError, as_bad_arguments, check_seed
+from csac_jax.cli.failures import check_seed
+from csac_jax.errors import SettingsError
 from csac_jax.render import gl
 from experiments.bench._options import Parser, emit
 
@@ -27,13 +28,12 @@ def main(arguments: list[str]) -> None:
         parser.error("--episodes: must be at least 1")
     check_seed(options.seed)
     if gl.choose() is None:
-        raise BadArgumentsError("bench closed_loop: OpenGL draws neither by EGL nor by OSMesa here")
+        raise SettingsError("bench closed_loop: OpenGL draws neither by EGL nor by OSMesa here")
     from experiments.bench import _closed_loop  # MuJoCo reads what `choose` sets when imported
 
     begun = time.perf_counter()
-    with as_bad_arguments(ValueError, FileNotFoundError):
-        loop = _closed_loop.make(options.policy, options.robot, options.episodes, options.seed)
-        sensors = _closed_loop.sensors(options.sensor)
+    loop = _closed_loop.make(options.policy, options.robot, options.episodes, options.seed)
+    sensors = _closed_loop.sensors(options.sensor)
     found = {name: _closed_loop.measure(loop, sensor) for name, sensor in sensors.items()}
     seconds = time.perf_counter() - begun
     result = {"options": vars(options), **found, "seconds": seconds}

@@ -24,8 +24,8 @@ import optax
 
 from csac_jax.agent import actor, actor_critic, critic, losses, maps, values
 from csac_jax.agent.actor_critic import ActorCritic
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, SmallNet
+from csac_jax.errors import SettingsError
 from csac_jax.nets import dense, networks
 from csac_jax.nets.convolution import conv2d
 from csac_jax.robot.primitives import Action
@@ -174,7 +174,7 @@ def main(arguments: list[str]) -> None:
     preset, options, flags = split(parser, arguments)
     cfg = config("learner", preset, flags)
     if options.repeats < 1:
-        raise BadArgumentsError("bench learner: --repeats: at least 1")
+        raise SettingsError("bench learner: --repeats: at least 1")
     if not isinstance(cfg.net, SmallNet):
-        raise BadArgumentsError(f"bench learner: {preset} has no small net; give quick or fast")
+        raise SettingsError(f"bench learner: {preset} has no small net; give quick or fast")
     emit({"preset": preset, **measure(cfg, options.repeats)})

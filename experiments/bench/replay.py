@@ -18,8 +18,8 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import BetaReplay, PrioritisedReplay, ReplayConfig, UniformReplay
+from csac_jax.errors import SettingsError
 from csac_jax.replay import ring, samplers
 from experiments.bench._options import emit
 
@@ -142,12 +142,12 @@ def _exponents(arguments: list[str]) -> range:
     if not arguments:
         return range(12, 21)
     if len(arguments) != 2 or not all(word.isdigit() for word in arguments):
-        raise BadArgumentsError(
+        raise SettingsError(
             "bench replay: give two exponents of 2, the smallest and the largest capacity, or none"
         )
     smallest, largest = map(int, arguments)
     if not BATCH <= 2**smallest <= 2**largest <= 2**24:
-        raise BadArgumentsError("bench replay: exponents must lie in 6 .. 24, the smaller first")
+        raise SettingsError("bench replay: exponents must lie in 6 .. 24, the smaller first")
     return range(smallest, largest + 1)
 
 
@@ -157,7 +157,7 @@ def main(arguments: list[str]) -> None:
     try:
         import flashbax  # noqa: F401
     except ImportError:
-        raise BadArgumentsError(
+        raise SettingsError(
             "bench replay needs flashbax; run: pip install 'csac-jax[bench]'"
         ) from None
     result = {

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import csac_jax
-from csac_jax.cli.failures import BadArgumentsError
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import provenance
 from experiments.bench import _options
 
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     checkouts = {"this": HERE}
     if options.other is not None:
         if not (options.other / "csac_jax").is_dir():
-            raise BadArgumentsError(f"bench start: --other: {options.other} is no checkout")
+            raise SettingsError(f"bench start: --other: {options.other} is no checkout")
         checkouts["other"] = options.other.resolve()
     shares = _shares(options.cores)[: options.runs]
     print(json.dumps(measure(train, options.runs, checkouts, shares), indent=2))
@@ -56,7 +56,7 @@ def _shares(cores: int | None) -> list[set[int]]:
         return [set()]
     every = sorted(os.sched_getaffinity(0))
     if not 1 <= cores <= len(every):
-        raise BadArgumentsError(f"bench start: --cores: must be from 1 to {len(every)}")
+        raise SettingsError(f"bench start: --cores: must be from 1 to {len(every)}")
     firsts = range(0, len(every) - cores + 1, cores)
     return [set(every[first : first + cores]) for first in firsts]
 

@@ -32,8 +32,8 @@ from csac_jax.agent import policy, values
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
 from csac_jax.cli import parsing
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config, PhysicsKind
+from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache, compiler
@@ -276,21 +276,19 @@ def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
     if preset not in presets.PRESETS:
-        raise BadArgumentsError(
+        raise SettingsError(
             f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick"
         )
     if min(options.steps, options.repeats) < 1:
-        raise BadArgumentsError("bench step: --steps, --repeats: at least 1")
+        raise SettingsError("bench step: --steps, --repeats: at least 1")
     if options.curve is None:
         if options.smallest or options.largest:
-            raise BadArgumentsError("bench step: --smallest and --largest belong to --curve")
+            raise SettingsError("bench step: --smallest and --largest belong to --curve")
         return preset, options, flags
     smallest, largest = CURVES[options.curve]
     options.smallest, options.largest = options.smallest or smallest, options.largest or largest
     if not 1 <= options.smallest <= options.largest:
-        raise BadArgumentsError(
-            "bench step: --smallest, --largest: 1 <= smallest <= largest is needed"
-        )
+        raise SettingsError("bench step: --smallest, --largest: 1 <= smallest <= largest is needed")
     return preset, options, flags
 
 
@@ -318,7 +316,7 @@ def main(arguments: list[str]) -> None:
             else []
         )
     except ValueError as error:
-        raise BadArgumentsError(f"bench step: {error}") from None
+        raise SettingsError(f"bench step: {error}") from None
     result = {
         "preset": preset,
         "settings": flags,

@@ -21,7 +21,6 @@ import jax
 from jax.profiler import ProfileData
 from jax.sharding import Mesh
 
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.errors import SettingsError
 from csac_jax.runtime import cache
 from csac_jax.sim import backend
@@ -89,7 +88,7 @@ def _shard(seeds: int) -> sharding.Shard:
 
 
 def main(arguments: list[str]) -> None:
-    """Prints the result. Raises BadArgumentsError for devices that are not there, or do not divide
+    """Prints the result. Raises SettingsError for devices that are not there, or do not divide
     the scenes or the seeds."""
     parser = Parser(prog="bench step_kernels", allow_abbrev=False)
     for name in ("--devices", "--seeds"):
@@ -98,13 +97,13 @@ def main(arguments: list[str]) -> None:
     cfg = config("step_kernels", preset, flags).change(train={"chunk": 1})
     seeds = options.seeds
     if seeds < 1:
-        raise BadArgumentsError("bench step_kernels: --seeds: at least 1")
+        raise SettingsError("bench step_kernels: --seeds: at least 1")
     cfg = backend.resolve(cfg, options.devices, seeds)
     try:
         mesh = sharding.make(options.devices)
         sharding.check(mesh, _shard(seeds), seeds, cfg.train.scenes, cfg.learn.batch)
     except ValueError as error:
-        raise BadArgumentsError(f"bench step_kernels: {error}") from None
+        raise SettingsError(f"bench step_kernels: {error}") from None
     cache.enable()
     state, chunk = _compiled(programs.make(cfg), mesh, seeds)
     for _ in range(2):

@@ -22,8 +22,8 @@ from typing import Any
 
 import jax
 
-from csac_jax.cli.failures import BadArgumentsError
 from csac_jax.config import Config
+from csac_jax.errors import SettingsError
 from csac_jax.runtime import compiler
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
@@ -74,7 +74,7 @@ def _config(preset: str, flags: list[str], options: Any) -> Config:
 
 
 def main(arguments: list[str]) -> None:
-    """Prints the result. Raises BadArgumentsError for what cannot be measured."""
+    """Prints the result. Raises SettingsError for what cannot be measured."""
     parser = Parser(prog="bench sweep", description=__doc__, allow_abbrev=False)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--devices", type=int, nargs="+", default=[1])
@@ -84,7 +84,7 @@ def main(arguments: list[str]) -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
     if min(*options.seeds, options.steps, options.repeats) < 1:
-        raise BadArgumentsError("bench sweep: --seeds, --steps, --repeats: at least 1")
+        raise SettingsError("bench sweep: --seeds, --steps, --repeats: at least 1")
     try:
         cfg = _config(preset, flags, options)
         for devices in options.devices:
@@ -94,7 +94,7 @@ def main(arguments: list[str]) -> None:
             most = runner.SweepPlan(max(options.seeds), [grid.SweepPoint("base", {}, cfg)])
             runner.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
-        raise BadArgumentsError(f"bench sweep: {error}") from None
+        raise SettingsError(f"bench sweep: {error}") from None
     program = programs.make(cfg)
     with_train = 1 in options.seeds and 1 in options.devices
     alone = (

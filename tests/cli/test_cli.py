@@ -21,7 +21,7 @@ import csac_jax
 from csac_jax import algorithms, api, cli, presets
 from csac_jax.cli import bench, evaluate, failures, output, play, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, SceneConfig, UniformReplay
-from csac_jax.errors import DataWarning
+from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
@@ -337,7 +337,7 @@ def test_which_checkpoint(capsys: pytest.CaptureFixture, run_dir: Path):
     """Claim: `--which` is the newest checkpoint, one by its step, or that of RUN/best; one that is
     not there is a line with the remedy."""
     assert policies.load_config(run_dir, 4) == policies.load_config(run_dir) == SMOKE
-    for which, message in (("best", "keeps its best with --eval-every N"), ("3", "saved are: 4")):
+    for which, message in (("best", "keeps its best with eval_every"), ("3", "saved are: 4")):
         _fails(capsys, 1, f"eval {run_dir} --policy random --which {which}", message)
     _saved(run_dir / "best", SMOKE.change(seed=9), 2)
     assert policies.load_config(run_dir, "best") == SMOKE.change(seed=9)
@@ -438,7 +438,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 
     def build(cfg, *_):
         configs.append(cfg)
-        raise ValueError("enough")
+        raise SettingsError("enough")
 
     for name in ("random10", "in_distribution"):
         monkeypatch.setitem(suites.SUITES, name, suites.Suite(build))
@@ -466,15 +466,15 @@ def test_any_policy_sees_through_another_camera(
         ("", {}),
         ("--augment on", {"augment": True}),
         ("--height-bonus 2", {"height_bonus": 2.0}),
-        ("--retry 0.1", {"retry_temperature": 0.1}),
+        ("--retry-temperature 0.1", {"retry_temperature": 0.1}),
     ],
 )
 def test_eval_changes_how_a_policy_decides(
     capsys: pytest.CaptureFixture, asked: list[Config], flags: str, expected: dict[str, Any]
 ):
     """Claim: `eval --augment on` makes any policy act on the mean over mirror images,
-    `--height-bonus` prefer what lies high and `--retry` draw another place after failures; without
-    them, the policy acts as it was trained to."""
+    `--height-bonus` prefer what lies high and `--retry-temperature` draw another place after
+    failures; without them, the policy acts as it was trained to."""
     _fails(capsys, 2, f"eval shipped --suite random10 {flags}")
     assert asked[0].policy == policies.load_config("shipped").change(policy=expected).policy
 

@@ -41,9 +41,10 @@ def test_config_survives_json(name: str):
 
 
 def test_format_is_stored():
-    """Claim: the format has a stored file, which is what is written today."""
+    """Claim: the format has a stored file, with the first names of its settings. It is read, and is
+    written today under the names of today."""
     stored = json.loads(STORED.read_text())
-    assert stored == _through_text(SAVED)
+    assert renames.current(stored) == _through_text(SAVED) != stored
     assert configs.from_dict(stored) == SAVED
 
 

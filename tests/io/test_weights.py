@@ -123,7 +123,10 @@ def _bent(tensors: dict[str, np.ndarray]) -> None:
     ("change", "message"),
     [
         (_lost, "tensor features.transition1.norm.running_var is missing"),
-        (_added, "tensor features.denseblock1.denselayer7.conv1.weight is none of DenseNet-121"),
+        (
+            _added,
+            "tensor features.denseblock1.denselayer7.conv1.weight is not part of DenseNet-121",
+        ),
         (_bent, r"tensor features.conv0.weight has the shape \[8, 1, 7, 7\], not \[8, 3, 7, 7\]"),
     ],
 )
