@@ -78,10 +78,7 @@ def draw(report: ResultReport) -> Iterator[Chart]:
 
 
 def training(curves: Sequence[Curve]) -> Figure:
-    """Draws success against actions, a line and a band per variant.
-
-    A panel has at most MOST_LINES.
-    """
+    """Draws success against actions, a line and a band per variant, at most MOST_LINES a panel."""
     groups = [curves[i : i + MOST_LINES] for i in range(0, len(curves), MOST_LINES)]
     size = (9.0, 4.2 if len(groups) == 1 else 0.6 + 2.4 * len(groups))
     figure, panels = plt.subplots(

@@ -170,7 +170,6 @@ def _training_gaps(ours: Curve, theirs: Curve) -> dict[str, Band]:
 
 
 def _difference(gap: Band | None, chance: Band | None, metric: str = "") -> str:
-    """Formats a difference and the probability of improvement."""
     p = "" if chance is None else f", P {100 * chance.value:.0f} %"
     return shown(gap, "+", metric) + p
 
@@ -281,10 +280,8 @@ def _wall_time(record: Json) -> str:
 
 
 def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
-    """Formats a band as blocks per action, counts per episode or per cent.
-
-    With a sign it is a difference, in points.
-    """
+    """Formats a band as blocks per action, counts per episode or per cent; with a sign as a
+    difference, in points."""
     if band is None:
         return "-"
     if metric in (*PER_ACTION, *PER_EPISODE):
