@@ -73,8 +73,8 @@ def close_figures() -> Iterator[None]:
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
-    """Two seeds of CSAC-beta, one of which ended early; one of VPG; one ablation; evaluations of
-    the first three."""
+    """Writes two seeds of CSAC-beta, one of which ended early, one of VPG, one ablation, and the
+    evaluations of the first three."""
     root, physics = tmp_path / "sweep", {"sim__physics": "c"}
     card = {"device": "a card", "commit": "abc"}
     _run(root / "beta" / "seed-0", _config("csac_beta", 0), [0.5, 0.8, 0.95], card)
