@@ -26,7 +26,7 @@ PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#C
 COLOURS = dict(zip(NAMES, PALETTE, strict=False))
 GREY = "#7F7F7F"
 MOST_LINES, MOST_SCORES = 6, 12  # of a panel; of a figure of a suite
-NAME_WIDTH, LEGEND_WIDTH = 36, 56  # characters of a line: right of a panel, below a figure
+NAME_WIDTH, LEGEND_WIDTH = 36, 46  # characters of a line: right of a panel, below a figure
 LONGEST = 100  # characters of a name
 LEGEND: dict[str, Any] = {  # right of a panel, where no curve is
     "loc": "upper left",

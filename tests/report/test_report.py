@@ -22,7 +22,7 @@ from csac_jax.cli import settings, train
 from csac_jax.cli.evaluate import EvalOptions
 from csac_jax.evaluation import metrics, statistics
 from csac_jax.io import configs, files
-from csac_jax.report import comparison, figures, page, result_tables, results, variants
+from csac_jax.report import comparison, figures, result_tables, results, variants
 from csac_jax.report.comparison import ResultReport
 
 CASES = ("hole", "row")
