@@ -84,7 +84,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def _as_markdown(path: Path) -> str | None:
-    """A source file as a page, a notebook cell by cell; None for files of other kinds."""
+    """Returns a source file as a page, a notebook cell by cell; None for files of other kinds."""
     if path.suffix == ".ipynb":
         cells = json.loads(path.read_text())["cells"]
         sources = [(cell["cell_type"], "".join(cell["source"])) for cell in cells]
@@ -134,7 +134,7 @@ def _source_page(path: str) -> str:
 
 
 def settings_tables() -> str:
-    """Every section of a config: its settings with defaults, ranges, units and meaning."""
+    """Lists every section of a config: its settings with defaults, ranges, units and meaning."""
     parts = []
     for field in dataclasses.fields(Config):
         if not isinstance(field.default, Section):
@@ -147,7 +147,6 @@ def settings_tables() -> str:
 
 
 def _settings_of(section: str, kind: Any) -> str:
-    """A table of the settings of a section."""
     docs = _field_docs(kind)
     rows = [
         (f"`{section}.{field.name}`", _value(field.default), _allowed(field), docs[field.name])
@@ -170,7 +169,6 @@ def _value(value: Any) -> str:
 
 
 def _allowed(field: Any) -> str:
-    """Choices or bounds of a setting's values."""
     kind = field.type
     kind = typing.get_args(kind)[0] if typing.get_origin(kind) is tuple else kind
     if typing.get_origin(kind) is typing.Literal:
@@ -183,7 +181,7 @@ def _allowed(field: Any) -> str:
 
 
 def commands() -> str:
-    """The help of every command, as it is printed."""
+    """Returns the help of every command, as it is printed."""
     parts = [f"```text\n{cli.USAGE}```"]
     for name in cli.COMMANDS:
         parts.append(f"## {name}\n\n```text\n{printed_help(name)}```")
@@ -191,7 +189,7 @@ def commands() -> str:
 
 
 def printed_help(command: str) -> str:
-    """What `csac-jax COMMAND --help` prints."""
+    """Returns what `csac-jax COMMAND --help` prints."""
     before, out = dict(os.environ), io.StringIO()
     os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1")
     try:
@@ -204,14 +202,14 @@ def printed_help(command: str) -> str:
 
 
 def record_table() -> str:
-    """The fields of a line of metrics.jsonl."""
+    """Returns a table of the fields of a line of metrics.jsonl."""
     docs = _field_docs(loop.Record)
     fields = dataclasses.fields(loop.Record)
     return _table(("field", "meaning"), [(f"`{f.name}`", docs.get(f.name, "")) for f in fields])
 
 
 def described(module: Any) -> Callable[[], str]:
-    """A table of the names that a module's docstring describes, `name` and text in columns."""
+    """Makes a table of the names that a module's docstring describes, in columns."""
     found = re.findall(r"(?m)^(`?\w[\w ]*`?)  +(.*(?:\n  +.*)*)", module.__doc__)
     rows = [(name, _text(text)) for name, text in found]
     return lambda: _table(("name", "is"), rows)
@@ -224,7 +222,6 @@ def _table(heads: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 
 
 def _text(text: str) -> str:
-    """A text in one line."""
     return " ".join(text.split())
 
 

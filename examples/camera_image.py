@@ -28,7 +28,7 @@ AWAY = 3.0  # m, where the blocks lie if the table is to be empty
 
 
 def draw(cfg: CameraConfig, shift: float) -> tuple[np.ndarray, np.ndarray]:
-    """Colour [h, w, 3] uint8 and depth [h, w] uint16 mm, 0 where the camera sees no table."""
+    """Draws colour [h, w, 3] uint8 and depth [h, w] uint16 mm, 0 where the camera sees no table."""
     x, y, yaw = np.array(POSES, np.float32).T
     half = jnp.broadcast_to(jnp.array(HALF), (len(POSES), 3))
     normal, offset = blocks.half_spaces(("box",) * len(POSES), half)
@@ -44,7 +44,7 @@ def draw(cfg: CameraConfig, shift: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lay(cfg: CameraConfig, colour: np.ndarray, page: np.ndarray) -> np.ndarray:
-    """The image with a page [rows, columns] uint8 on the empty table, its middle at the origin."""
+    """Draws a page [rows, columns] uint8 into the image, on the empty table around the origin."""
     rows, cols = (side // COARSE for side in page.shape)
     ink = page[: rows * COARSE, : cols * COARSE].reshape(rows, COARSE, cols, COARSE).mean((1, 3))
     eye = camera.make(cfg)

@@ -19,7 +19,7 @@ from csac_jax.deploy import CameraPolicy
 
 
 def image(message: Any) -> np.ndarray:
-    """The pixels of a sensor_msgs/Image: rgb8 and bgr8 as RGB, 16UC1 (mm) and 32FC1 as m."""
+    """Returns pixels of a sensor_msgs/Image: rgb8 and bgr8 as RGB, 16UC1 (mm) and 32FC1 as m."""
     kinds = {"rgb8": ("u1", 3), "bgr8": ("u1", 3), "16UC1": ("u2", 1), "32FC1": ("f4", 1)}
     if message.encoding not in kinds:
         raise ValueError(f"encoding {message.encoding} is not one of: {', '.join(kinds)}")
@@ -34,13 +34,13 @@ def image(message: Any) -> np.ndarray:
 
 
 def intrinsics(info: Any) -> dict[str, Any]:
-    """What `CameraPolicy.decide` takes, of a sensor_msgs/CameraInfo."""
+    """Returns the intrinsics that `CameraPolicy.decide` takes, of a sensor_msgs/CameraInfo."""
     names = {"fx": info.k[0], "fy": info.k[4], "cx": info.k[2], "cy": info.k[5]}
     return {"width": info.width, "height": info.height, **names, "distortion": tuple(info.d)[:5]}
 
 
 def matrix(transform: Any) -> np.ndarray:
-    """A geometry_msgs/Transform as 4 x 4."""
+    """Converts a geometry_msgs/Transform to 4 x 4."""
     q, t, pose = transform.rotation, transform.translation, np.eye(4)
     pose[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     pose[:3, 3] = t.x, t.y, t.z

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 
 def set_points(decision: dict[str, Any], reach: float, lowest: float) -> list[list[float]]:
-    """Poses as `moveL` takes them: x, y, z m and a rotation vector, rad, in the robot's frame.
+    """Returns poses as `moveL` takes them: x, y, z m and a rotation vector, rad, robot's frame.
     Raises ValueError for one that is farther than `reach` m or lower than `lowest` m."""
     tools = np.array([waypoint["tool"] for waypoint in decision["waypoints"]], float)
     vectors = Rotation.from_matrix(tools[:, :3, :3]).as_rotvec()

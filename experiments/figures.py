@@ -45,12 +45,9 @@ CURVES = {
 
 def linked() -> set[str]:
     """Returns the names of the figures that README and docs show."""
-    documents = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
-    return {
-        name
-        for path in documents
-        for name in re.findall(r"figures/([\w-]+)\.png", path.read_text())
-    }
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    text = "\n".join(page.read_text() for page in pages)
+    return set(re.findall(r"figures/([\w-]+)\.png", text))
 
 
 def draw() -> Iterator[tuple[str, Figure]]:

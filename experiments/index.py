@@ -76,10 +76,8 @@ def _commands(found: Results) -> list[str]:
 def _benchmarks() -> Iterator[dict[str, str]]:
     for path in sorted(RESULTS.glob("bench/*.json")):
         for name, one in json.loads(path.read_text()).items():
-            place = f"{path.relative_to(RESULTS)}: {name}"
-            yield _row(
-                one["about"], place, f"`{one['command']}`", one.get("device", "not recorded")
-            )
+            device = one.get("device", "not recorded")
+            yield _row(one["about"], f"bench/{path.name}: {name}", f"`{one['command']}`", device)
 
 
 def _row(about: str, place: str, command: str, device: str) -> dict[str, str]:

@@ -74,7 +74,6 @@ def close_view(positions: np.ndarray) -> Viewpoint:
 
 
 def _smaller(image: np.ndarray) -> np.ndarray:
-    """Averages each FINER x FINER pixels."""
     height, width, _ = image.shape
     parts = image.reshape(height // FINER, FINER, width // FINER, FINER, 3)
     return np.round(parts.mean(axis=(1, 3))).astype(np.uint8)

@@ -35,27 +35,24 @@ class Curve(NamedTuple):
     @property
     def final(self) -> list[np.ndarray]:
         """Returns the success over the last grasps of each run, by seed."""
-        return self.by_seed([run.success[-1] for run in self.runs])
+        return self._by_seed([run.success[-1] for run in self.runs])
 
     @property
     def area(self) -> list[np.ndarray]:
         """Returns the mean success over the actions that all runs have, by seed."""
         end = self.ends[0]
-        return self.by_seed([statistics.area(run.actions, run.success, end) for run in self.runs])
+        return self._by_seed([statistics.area(run.actions, run.success, end) for run in self.runs])
 
-    def by_seed(self, values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
-        """Returns values of the runs as a stratum: an array [hosts] per seed."""
+    def _by_seed(self, values: Sequence[float] | np.ndarray) -> list[np.ndarray]:
         return statistics.by_seed(self.seeds, values)
 
     def rate(self, above: Sequence[str], below: Sequence[str]) -> Band | None:
         """Divides sums of totals over all of training; None where a run lacks some."""
         if not all(run.totals.keys() >= {*above, *below} for run in self.runs):
             return None
-        rows = [
-            [sum(run.totals[n] for n in names) for run in self.runs] for names in (above, below)
-        ]
-        over, under = map(np.array, rows)
-        return statistics.band([self.by_seed(over / under)]) if under.all() else None
+        over = np.array([sum(run.totals[name] for name in above) for run in self.runs])
+        under = np.array([sum(run.totals[name] for name in below) for run in self.runs])
+        return statistics.band([self._by_seed(over / under)]) if under.all() else None
 
     def points(self) -> tuple[np.ndarray, list[Band]]:
         """Returns actions [m], up to where the shortest run ends, and the success there."""
@@ -104,13 +101,12 @@ class Score(NamedTuple):
         return [*single, self] if len(single) > 1 else single
 
     def band(self, metric: str) -> Band | None:
-        """Computes the mean over parts of the IQM over runs; None without cases.
-
-        A single value keeps the interval of its episodes.
-        """
+        """Computes the mean over parts of the IQM over runs; None without cases. A single value
+        keeps the interval of its episodes."""
         counted = [_with_cases(runs, metric) for runs in self.parts.values()]
         if [len(runs) for runs in counted] == [1]:
-            return Band(**counted[0][0].metrics[metric])._replace(n=1)
+            share = counted[0][0].metrics[metric]
+            return Band(share["value"], share["low"], share["high"], 1)
         return statistics.band(self.strata(metric)) if all(counted) else None
 
     def strata(self, metric: str) -> list[list[np.ndarray]]:
@@ -141,10 +137,7 @@ class ResultReport(NamedTuple):
 
 
 def build(results: Results, reference: str | None = None) -> ResultReport:
-    """Groups runs and evaluations over their seeds.
-
-    Raises SettingsError for a reference that has no run and no evaluation.
-    """
+    """Groups runs and evaluations over seeds. Raises SettingsError for a reference without results."""
     curves = [Curve(*group) for group in grouped(results.runs, lambda run: run.variant).items()]
     scores = [
         Score._make((*key, grouped(group, lambda one: one.part)))
@@ -194,10 +187,8 @@ def _pairs(
 
 
 def pairs(report: ResultReport) -> Iterator[tuple[Score, Score]]:
-    """Yields the reference and another variant, in each part and in all parts.
-
-    Both were measured in the same scenes, with several seeds.
-    """
+    """Yields the reference and another variant, in each part and in all parts: both measured in the
+    same scenes, with several seeds."""
     several = [
         score.only(*(part for part, runs in score.parts.items() if len(set(seeds_of(runs))) > 1))
         for score in report.scores

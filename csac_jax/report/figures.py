@@ -26,7 +26,7 @@ PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#C
 COLOURS = dict(zip(NAMES, PALETTE, strict=False))
 GREY = "#7F7F7F"
 MOST_LINES, MOST_SCORES = 6, 12  # of a panel; of a figure of a suite
-NAME_WIDTH, LEGEND_WIDTH = 36, 56  # characters of a line: right of a panel, below a figure
+NAME_WIDTH, LEGEND_WIDTH = 36, 46  # characters of a line: right of a panel, below a figure
 LONGEST = 100  # characters of a name
 LEGEND: dict[str, Any] = {  # right of a panel, where no curve is
     "loc": "upper left",
@@ -78,10 +78,7 @@ def draw(report: ResultReport) -> Iterator[Chart]:
 
 
 def training(curves: Sequence[Curve]) -> Figure:
-    """Draws success against actions, a line and a band per variant.
-
-    A panel has at most MOST_LINES.
-    """
+    """Draws success against actions, a line and a band per variant, at most MOST_LINES a panel."""
     groups = [curves[i : i + MOST_LINES] for i in range(0, len(curves), MOST_LINES)]
     size = (9.0, 4.2 if len(groups) == 1 else 0.6 + 2.4 * len(groups))
     figure, panels = plt.subplots(

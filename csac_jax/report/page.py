@@ -26,10 +26,8 @@ MOST_MEDIA = 12
 
 
 def write(report: ResultReport, paths: Sequence[Path], folder: Path) -> list[Path]:
-    """Writes index.html, which needs no other file, and results.md.
-
-    Pictures and videos that lie in `paths`, as `play` writes them, are in the page.
-    """
+    """Writes index.html, which needs no other file, and results.md. Pictures and videos that lie in
+    `paths`, as `play` writes them, are in the page."""
     folder.mkdir(parents=True, exist_ok=True)
     pages = {"index.html": render(report, paths), "results.md": result_tables.markdown(report)}
     for name, text in pages.items():

@@ -9,15 +9,8 @@ from csac_jax.constants import GRASP_WINDOW
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import PER_ACTION, PER_EPISODE
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report.comparison import (
-    Curve,
-    ResultReport,
-    Score,
-    compared,
-    curve_pairs,
-    pairs,
-    seeds_of,
-)
+from csac_jax.report import comparison
+from csac_jax.report.comparison import Curve, ResultReport, Score, compared
 from csac_jax.report.results import METRICS, RecordedRun
 from csac_jax.report.variants import Json, Variant, label, train_command
 
@@ -64,9 +57,9 @@ def as_json(report: ResultReport) -> Json:
         "curves": [_curve_json(curve) for curve in report.curves],
         "scores": [_score_json(score, part) for score in report.scores for part in score.parts],
         "training_differences": [
-            _both(*pair) | _plain(_training_gaps(*pair)) for pair in curve_pairs(report)
+            _both(*pair) | _plain(_training_gaps(*pair)) for pair in comparison.curve_pairs(report)
         ],
-        "differences": [_difference_json(*pair) for pair in pairs(report)],
+        "differences": [_difference_json(*pair) for pair in comparison.pairs(report)],
         "provenance": provenance(report),
         "notes": report.notes,
     }
@@ -86,7 +79,10 @@ def _curve_json(curve: Curve) -> Json:
 
 
 def _score_json(score: Score, part: str) -> Json:
-    fields = score._asdict() | {"part": part, "seeds": sorted(seeds_of(score.parts[part]))}
+    fields = score._asdict() | {
+        "part": part,
+        "seeds": sorted(comparison.seeds_of(score.parts[part])),
+    }
     del fields["parts"]
     metrics = _plain({name: score.only(part).band(name) for name in METRICS})
     return _named(fields.pop("variant")) | fields | {"metrics": metrics}
@@ -153,7 +149,7 @@ def _training_row(curve: Curve) -> dict[str, str]:
 def training_differences(report: ResultReport) -> ResultTable:
     """Builds the table of how far the reference is ahead in training, a row per other variant."""
     rows = []
-    for ours, theirs in curve_pairs(report):
+    for ours, theirs in comparison.curve_pairs(report):
         final, area, chance = _training_gaps(ours, theirs).values()
         names = {"ahead": label(ours.variant), "of": label(theirs.variant)}
         rows.append(names | {LAST: _difference(final, chance), AREA: shown(area, "+")})
@@ -170,7 +166,6 @@ def _training_gaps(ours: Curve, theirs: Curve) -> dict[str, Band]:
 
 
 def _difference(gap: Band | None, chance: Band | None, metric: str = "") -> str:
-    """Formats a difference and the probability of improvement."""
     p = "" if chance is None else f", P {100 * chance.value:.0f} %"
     return shown(gap, "+", metric) + p
 
@@ -188,13 +183,17 @@ def _range(values: Sequence[float], spec: str) -> str:
 
 def evaluation(report: ResultReport) -> ResultTable:
     """Builds the table of evaluations: a row per part of a suite, and their mean."""
-    return [_evaluation_row(part) for score in report.scores for part in score.split()]
-
-
-def _evaluation_row(score: Score) -> dict[str, str]:
-    runs = sum(map(len, score.parts.values()))
-    counts = {"runs": str(score.most_runs), "episodes": str(score.episodes * runs)}
-    return {"policy": score.name, **_place_cells(score), **counts, **metric_cells(score)}
+    return [
+        {
+            "policy": score.name,
+            **_place_cells(score),
+            "runs": str(score.most_runs),
+            "episodes": str(score.episodes * sum(map(len, score.parts.values()))),
+            **metric_cells(score),
+        }
+        for whole in report.scores
+        for score in whole.split()
+    ]
 
 
 def metric_cells(score: Score) -> dict[str, str]:
@@ -205,15 +204,13 @@ def metric_cells(score: Score) -> dict[str, str]:
 def differences(report: ResultReport) -> ResultTable:
     """Builds the table of how far the reference is ahead, a row per other variant and part."""
     rows = []
-    for ours, theirs in pairs(report):
+    for ours, theirs in comparison.pairs(report):
         gaps = compared(ours, theirs, statistics.difference, METRICS)
         chances = compared(ours, theirs, statistics.improvement, IMPROVED)
-        names = {"ahead": label(ours.variant), "of": label(theirs.variant)}
-        cells = {
-            title: _difference(gaps.get(key), chances.get(key), key)
-            for key, title in METRICS.items()
-        }
-        rows.append(names | _place_cells(ours) | cells)
+        row = {"ahead": label(ours.variant), "of": label(theirs.variant)} | _place_cells(ours)
+        for key, title in METRICS.items():
+            row[title] = _difference(gaps.get(key), chances.get(key), key)
+        rows.append(row)
     return rows
 
 
@@ -249,13 +246,10 @@ def _place_cells(score: Score) -> dict[str, str]:
 
 def provenance(report: ResultReport) -> ResultTable:
     """Builds the table of where numbers come from, a row per file."""
-    runs = {run.path: (train_command(run.config), run.record) for run in report.results.runs}
     trained = {run.path.parent: run.config for run in report.results.runs}
-    measured = {
-        one.path: (one.command(trained.get(one.path.parent)), one.record)
-        for one in report.results.evaluations
-    }
-    files = runs | measured
+    files = {run.path: (train_command(run.config), run.record) for run in report.results.runs}
+    for one in report.results.evaluations:
+        files[one.path] = one.command(trained.get(one.path.parent)), one.record
     root = os.path.commonpath([path.parent for path in files]) if files else ""
     return [
         {
@@ -281,10 +275,8 @@ def _wall_time(record: Json) -> str:
 
 
 def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
-    """Formats a band as blocks per action, counts per episode or per cent.
-
-    With a sign it is a difference, in points.
-    """
+    """Formats a band as blocks per action, counts per episode or per cent; with a sign as a
+    difference, in points."""
     if band is None:
         return "-"
     if metric in (*PER_ACTION, *PER_EPISODE):

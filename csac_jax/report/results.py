@@ -96,9 +96,7 @@ class Results(NamedTuple):
 
 def read(paths: Iterable[Path]) -> Results:
     """Reads folders, files and archives; of a folder also the archives that lie directly in it.
-
-    Raises SettingsError for a path that is none of them.
-    """
+    Raises SettingsError for a path that is none of them."""
     results = Results([], [], [])
     for path in paths:
         archives = sorted(path.glob(f"*{ARCHIVE}")) if path.is_dir() else []
@@ -175,7 +173,7 @@ def _read_json(path: Path) -> Json:
 
 
 def _check(content: Any, shape: Json, name: str) -> None:
-    """Raises ValueError where an object has a key of `shape` with a value of another type."""
+    """Raises SettingsError where an object has a key of `shape` with a value of another type."""
     if not isinstance(content, dict):
         raise ValueError(f"{name} is no object")
     for key, kind in shape.items():
@@ -279,10 +277,8 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 
 
 def _variant(file: Path, path: Path, config: Json) -> Variant:
-    """Builds the variant of a file. Its source is the folder; of several seeds, the one above.
-
-    An evaluation's source also names its file. Its robot is that of the run.
-    """
+    """Builds the variant of a file. Its source is the folder; of several seeds, the one above. An
+    evaluation's source also names its file. Its robot is that of the run."""
     folder = path.resolve().parent
     source = folder.parent.name if folder.name.startswith("seed-") else folder.name
     if path.name != files.METRICS:

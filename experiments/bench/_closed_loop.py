@@ -134,10 +134,11 @@ def _episode(
     scene = _first_scene(loop, number)
     blocks, taken_before = int(scene.in_play.sum()), counts["blocks_taken"]
     counts["blocks"] += blocks
-    studio = RgbdRenderer(model.build(env.cfg.scene, env.cfg.sim), scene, env.cfg.camera.size)
-    unchanged = 0
+    world = model.build(env.cfg.scene, env.cfg.sim)
+    studio = RgbdRenderer(world, scene, env.cfg.camera.size)
+    unchanged, episode_key = 0, jax.random.fold_in(jax.random.key(loop.seed), number)
     for action in range(task.max_actions):
-        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(loop.seed), number), action)
+        key = jax.random.fold_in(episode_key, action)
         image = _photograph(env.cfg, errors, key, studio, scene)
         begun = time.perf_counter()
         decision = _decide(loop.policy, env.cfg, image, counts)
@@ -184,10 +185,7 @@ _sensed = jax.jit(sensor.image, static_argnums=(1, 2))
 
 
 def _decide(
-    policy: CameraPolicy,
-    cfg: Config,
-    image: tuple[np.ndarray, np.ndarray],
-    counts: collections.Counter[str],
+    policy: CameraPolicy, cfg: Config, image: Any, counts: collections.Counter[str]
 ) -> Decision | None:
     """Returns the best action; None where the image is refused or shows nothing to act on."""
     with warnings.catch_warnings(record=True) as caught:

@@ -77,7 +77,6 @@ def _observations(size: int, num: int) -> Observation:
 
 
 def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
-    """Times the Q maps of `states` states at once."""
     learner = actor_critic.make(cfg)
     abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     params, obs = _random(abstract.online), _observations(cfg.heightmap.size, states)
@@ -93,8 +92,7 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
     assert memory is not None
     return {
         "states": states,
-        "pixels_of_a_pass": learner.frames.tables.canvas
-        * (cfg.net.upsample if isinstance(cfg.net, DenseNet121) else 1),
+        "pixels_of_a_pass": learner.frames.tables.canvas * getattr(cfg.net, "upsample", 1),
         "maps": list(dense_maps.out_info.shape),
         "seconds_per_state": seconds / states,
         "compile_seconds": round(compiled, 1),
@@ -103,7 +101,6 @@ def _ours(cfg: Config, states: int, repeats: int) -> dict[str, Any]:
 
 
 def _update_memory(learner: ActorCritic) -> int:
-    """Returns the temporary bytes of one update of the critic."""
     state = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner))
     size = learner.cfg.learn.batch
     batch = jax.tree.map(
@@ -118,7 +115,6 @@ def _update_memory(learner: ActorCritic) -> int:
 
 
 def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
-    """Times a small net with the map and the batch of `quick`."""
     cfg = dataclasses.replace(presets.quick(), net=net)
     learner = actor_critic.make(cfg)
     abstract = jax.eval_shape(lambda: actor_critic.init(jax.random.key(0), learner)).online
@@ -140,9 +136,5 @@ def main(arguments: list[str]) -> None:
     cfg = _densenet(pixels, options["upsample"])
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
     nets = {"default": SmallNet(), "quick": presets.quick().net, "fast": presets.fast().net}
-    result = {
-        "options": options,
-        "densenet121": ours,
-        "small": {name: _small(net, options["states"], repeats) for name, net in nets.items()},
-    }
-    emit(result)
+    small = {name: _small(net, options["states"], repeats) for name, net in nets.items()}
+    emit({"options": options, "densenet121": ours, "small": small})

@@ -72,27 +72,18 @@ def measure(scenes: int, repeats: int, warp: bool) -> dict[str, Any]:
             calls |= {f"{kind} {name}": call for name, call in _calls(cfg, scenes).items()}
             print(f"{kind}: {scenes} scenes at rest", file=sys.stderr, flush=True)
         seconds = medians(calls, repeats)
-        lost = {
-            kind: int(calls[f"{kind} action"]().info.contact_overflow.sum()) for kind in configs
-        }
+        after = {kind: calls[f"{kind} action"]() for kind in configs}
+        lost = {kind: int(state.info.contact_overflow.sum()) for kind, state in after.items()}
         parts = {
             kind: float(object_slots.table(cfg.scene).present.sum(axis=1).mean())
             for kind, cfg in configs.items()
             if cfg.scene.has_objects
         }
     each = {name: 1e3 * value / scenes for name, value in seconds.items()}
-    ratios = {
-        name: value / each[f"blocks {name.split()[1]}"]
-        for name, value in each.items()
-        if not name.startswith("blocks")
-    }
-    return {
-        "scenes": scenes,
-        "milliseconds": each,
-        "over_blocks": ratios,
-        "mean_parts": parts,
-        "overflows": lost,
-    }
+    blocks = {name: each[f"blocks {name.split()[1]}"] for name in each}
+    ratios = {name: each[name] / blocks[name] for name in each if not name.startswith("blocks")}
+    result: dict[str, Any] = {"scenes": scenes, "milliseconds": each, "over_blocks": ratios}
+    return result | {"mean_parts": parts, "overflows": lost}
 
 
 def main(arguments: list[str]) -> None:

@@ -58,11 +58,8 @@ def pile_config(slots: tuple[SlotKind, ...], in_play: int, physics: PhysicsKind 
 
 
 def _batches(tree: Any, size: int) -> list[Any]:
-    count = jax.tree.leaves(tree)[0].shape[0]
-    return [
-        jax.tree.map(lambda leaf, i=i: leaf[i : i + size], tree)
-        for i in range(0, count - size + 1, size)
-    ]
+    starts = range(0, jax.tree.leaves(tree)[0].shape[0] - size + 1, size)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i : i + size], tree) for i in starts]
 
 
 class Bench:
@@ -112,11 +109,8 @@ class Bench:
 def _nudged(scenes: SceneState) -> SceneState:
     """Moves each block in play by a micrometre, each in its own direction."""
     angle = np.random.default_rng(STREAM).uniform(0.0, 2.0 * np.pi, scenes.position.shape[:2])
-    step = (
-        NUDGE
-        * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
-        * scenes.in_play[..., None]
-    )
+    direction = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+    step = NUDGE * direction * scenes.in_play[..., None]
     return scenes.replace(position=scenes.position + step.astype(np.float32))
 
 
@@ -149,40 +143,36 @@ def piles(
         pushes = bench.push(keys, scenes)
         rows.append((scenes, *(bench.run(engines, scenes, act) for act in (grasps, pushes))))
     starts = np.concatenate([row[0].position for row in rows])
-    grasped, pushed = (
-        {
-            name: [
-                np.concatenate(leaf) for leaf in zip(*(row[i][name] for row in rows), strict=True)
-            ]
-            for name in engines
-        }
-        for i in (1, 2)
-    )
+
+    def joined(i: int) -> dict[str, list[np.ndarray]]:
+        leaves = {name: zip(*(row[i][name] for row in rows), strict=True) for name in engines}
+        return {name: list(map(np.concatenate, every)) for name, every in leaves.items()}
+
+    grasped, pushed = joined(1), joined(2)
     lifted = {name: float(np.mean(grasped[name][1] == Outcome.LIFTED)) for name in bench.engines}
+    overflows = np.concatenate([grasped[physics][2], pushed[physics][2]])
     return {
         "blocks": in_play,
         "grasps": len(starts),
         "oracle_lifts": lifted,
-        **_agreement(starts, *((runs[physics], runs[REFERENCE]) for runs in (grasped, pushed))),
-        **{
-            name: _agreement(starts, *((runs[name], runs[REFERENCE]) for runs in (grasped, pushed)))
-            for name in bench.references
-        },
-        "saturated_substeps_share": _overflow_share(cfg, grasped[physics], pushed[physics]),
+        **_agreement(starts, physics, grasped, pushed),
+        **{name: _agreement(starts, name, grasped, pushed) for name in bench.references},
+        "saturated_substeps_share": float(overflows.mean() / cfg.sim.substeps),
         "physics_diverged": int(grasped[physics][3].sum() + pushed[physics][3].sum()),
     }
 
 
 def _agreement(
-    starts: np.ndarray, grasped: tuple[list, list], pushed: tuple[list, list]
+    starts: np.ndarray, name: str, grasped: dict[str, list], pushed: dict[str, list]
 ) -> dict[str, Any]:
-    """Compares grasps and pushes, each a pair: runs of an engine and of the reference."""
-    effect, wanted = (np.linalg.norm(run[0] - starts, axis=2).max(axis=1) > MOVED for run in pushed)
+    """Compares grasps and pushes of the engine `name` with those of the reference."""
+    both = pushed[name], pushed[REFERENCE]
+    effect, wanted = (np.linalg.norm(run[0] - starts, axis=2).max(axis=1) > MOVED for run in both)
     return {
-        "grasp_outcome_equal": float(np.mean(grasped[0][1] == grasped[1][1])),
+        "grasp_outcome_equal": float(np.mean(grasped[name][1] == grasped[REFERENCE][1])),
         "push_effect_equal": float(np.mean(effect == wanted)),
         "pushes_with_effect": [float(effect.mean()), float(wanted.mean())],
-        "pushed_block_apart_mm": _distances(starts, *pushed),
+        "pushed_block_apart_mm": _distances(starts, *both),
     }
 
 
@@ -200,10 +190,6 @@ def _distances(
         "median_moved": float(1e3 * np.median(moved[rows, slot])),
         "pushes": len(rows),
     }
-
-
-def _overflow_share(cfg: Config, *runs: list[np.ndarray]) -> float:
-    return float(np.mean([run[2].mean() for run in runs]) / cfg.sim.substeps)
 
 
 def shapes(poses: int, physics: PhysicsKind) -> dict[str, Any]:
@@ -240,19 +226,12 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> SceneState:
     slot = cfg.scene.slots.index(blocks.SHAPES[shape].kind)
     at_rest: list[SceneState] = []
     while len(at_rest) < count:
-        scene = scene_state.parked(cfg.scene.slots)
-        half = scene.half_size.copy()
-        position, quaternion = scene.position.copy(), scene.quaternion.copy()
-        half[slot] = blocks.SHAPES[shape].half_size
-        position[slot] = [*rng.uniform(-0.12, 0.12, 2), cfg.scene.drop_height]
+        scene = jax.tree.map(np.copy, scene_state.parked(cfg.scene.slots))
         rotation = rng.normal(size=4)
-        quaternion[slot] = rotation / np.linalg.norm(rotation)
-        dropped = scene.replace(
-            half_size=half,
-            position=position,
-            quaternion=quaternion,
-            in_play=np.arange(len(half)) == slot,
-        )
+        scene.half_size[slot] = blocks.SHAPES[shape].half_size
+        scene.position[slot] = [*rng.uniform(-0.12, 0.12, 2), cfg.scene.drop_height]
+        scene.quaternion[slot] = rotation / np.linalg.norm(rotation)
+        dropped = scene.replace(in_play=np.arange(len(scene.half_size)) == slot)
         fields = jax.device_get(model.scene_fields(bench.world, dropped))
         ended = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
         at_rest += [ended] if ended is not None else []

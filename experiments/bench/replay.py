@@ -44,7 +44,6 @@ def _new_errors(slots: jax.Array, items: Any, weights: jax.Array) -> jax.Array:
 
 
 def _ours(cfg: ReplayConfig) -> tuple[Any, Step]:
-    """Makes a full ring and its step."""
     sampler, capacity = samplers.make(cfg), cfg.capacity
     state = ring.init(sampler.init(capacity), ITEM).replace(size=jnp.int32(capacity))
     errors = jnp.exp(jax.random.normal(jax.random.key(0), (capacity,)))
@@ -87,7 +86,6 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
 
 
 def _sorting(capacity: int, steps: int) -> Callable[[], float]:
-    """Returns the timer of the beta sampler that sorts a ring of any size."""
     with mock.patch.object(samplers, "SORTED", capacity):  # read as the program is traced
         return _timer(*_ours(BetaReplay(capacity=capacity)), steps)
 

@@ -49,7 +49,6 @@ def ask(port: int, content: bytes) -> tuple[float, float]:
 
 
 def _until_ready(port: int, process: subprocess.Popen[bytes]) -> None:
-    """Returns once the service answers."""
     begun = time.perf_counter()
     while process.poll() is None and time.perf_counter() - begun < PATIENCE:
         try:
@@ -63,7 +62,6 @@ def _until_ready(port: int, process: subprocess.Popen[bytes]) -> None:
 
 
 def _summary(seconds: list[tuple[float, float]]) -> dict[str, float]:
-    """Computes percentiles, ms."""
     whole, own = 1e3 * np.array(seconds).T
     levels = {"p50_ms": (whole, 50), "p99_ms": (whole, 99), "decision_p50_ms": (own, 50)}
     return {name: float(np.percentile(values, level)) for name, (values, level) in levels.items()}

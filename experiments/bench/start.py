@@ -35,6 +35,7 @@ GRASPS, SHARE = 200, 0.9  # that the run is waited for
 
 
 def main(arguments: Sequence[str] = ()) -> None:
+    """Prints the result."""
     parser = _options.Parser(prog="bench start", allow_abbrev=False)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--other", type=Path)
@@ -86,9 +87,10 @@ def measure(
     median = {name: _median(times) for name, times in every.items()}
     result: dict[str, Any] = {"train": train, "runs": every, "median": median}
     result |= {"cores": len(shares[0]) or None, "side_by_side": len(shares)}
-    if "other" in median:
+    if other := median.get("other"):
+        pairs = {part: (other[part], after) for part, after in median["this"].items()}
         result["times_sooner"] = {
-            part: _ratio(median["other"][part], median["this"][part]) for part in median["this"]
+            part: a / b if a and b else None for part, (a, b) in pairs.items()
         }
     return result | {"load": os.getloadavg()} | provenance.record()
 
@@ -101,10 +103,6 @@ def _median(times: list[dict[str, Any]]) -> dict[str, Any]:
         for part in times[0]
     }
     return {part: None if value == late else value for part, value in found.items()}
-
-
-def _ratio(before: float | None, after: float | None) -> float | None:
-    return before / after if before and after else None
 
 
 def _run(train: list[str], seed: int, checkout: Path) -> dict[str, float | None]:
@@ -154,7 +152,3 @@ def _train(
             process.terminate()
         process.stdout.read()
     return seconds, run_dir
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -14,7 +14,6 @@ the map, or transitions in the ring; contact caps grow with the blocks. On an ac
 """
 
 import argparse
-import concurrent.futures
 import contextlib
 import functools
 import resource
@@ -27,7 +26,6 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.compilation_cache import compilation_cache
 
-from csac_jax import presets
 from csac_jax.agent import policy, values
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
@@ -94,15 +92,8 @@ def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, 
         return chunk, {"cold": cold, "cached": cached, "found_in_cache": cache.hits() > hits}
 
 
-def _compile_together(programs: dict[str, tuple[Any, tuple[Any, ...]]]) -> dict[str, Any]:
-    """Compiles jitted functions for their arguments or shapes, all at a time."""
-    with concurrent.futures.ThreadPoolExecutor() as threads:
-        compiled = threads.map(lambda pair: pair[0].lower(*pair[1]).compile(), programs.values())
-        return dict(zip(programs, compiled, strict=True))
-
-
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
-    """Compiles the stages of `train_step`; returns a call of each."""
+    """Returns a call of each stage of `train_step`, compiled by itself."""
     cfg, env, learner = program.cfg, program.env, program.learner
     assert isinstance(learner, CSAC)
     parts = learner.parts
@@ -130,7 +121,7 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         return transitions.where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
-    stages = {
+    run = {
         "dense_maps": jit(lambda params, obs: values.dense_maps(parts, params, obs)),
         "act": jax.jit(act),
         "simulate": jax.jit(jax.vmap(env.step)),
@@ -141,20 +132,6 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         ),
         "replace": jax.jit(replace),
     }
-    maps = jax.eval_shape(stages["dense_maps"], nets.online, scenes.obs)
-    action = jax.eval_shape(stages["act"], keys, maps, scenes.steps_without_change)
-    after = jax.eval_shape(stages["simulate"], scenes, action)
-    shapes = {
-        "dense_maps": (nets.online, scenes.obs),
-        "act": (keys, maps, scenes.steps_without_change),
-        "simulate": (scenes, action),
-        "reward": (nets, scenes, action, after),
-        "remember": (state.replay, scenes, action, after),
-        "learn": (key, nets, state.replay),
-        "replace": (keys, after),
-    }
-    run = _compile_together({name: (stages[name], arguments) for name, arguments in shapes.items()})
-
     maps = run["dense_maps"](nets.online, scenes.obs)
     action = run["act"](keys, maps, scenes.steps_without_change)
     after = run["simulate"](scenes, action)
@@ -166,7 +143,8 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         replay = run["remember"](replay, scenes, action, after)
         return replay.head
 
-    calls: dict[str, Callable[[], Any]] = {
+    bare = _bare.joint_trajectories(cfg, scenes.obs.height, action)
+    return {
         "dense_maps": lambda: run["dense_maps"](nets.online, scenes.obs),
         "act": lambda: run["act"](keys, maps, scenes.steps_without_change),
         "simulate": lambda: run["simulate"](scenes, action),
@@ -174,11 +152,8 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "remember": remember_again,
         "learn": lambda: run["learn"](key, nets, filled),
         "replace": lambda: run["replace"](keys, after),
+        "bare_loop": _bare.loop(env.physics, scenes.scene, bare),
     }
-    calls["bare_loop"] = _bare.loop(
-        env.physics, scenes.scene, _bare.joint_trajectories(cfg, scenes.obs.height, action)
-    )
-    return calls
 
 
 def _whole(chunk: Any, cfg: Config, state: step.TrainState) -> Callable[[], Any]:
@@ -194,7 +169,6 @@ def _whole(chunk: Any, cfg: Config, state: step.TrainState) -> Callable[[], Any]
 
 
 def _rates(cfg: Config, seconds: float) -> dict[str, float]:
-    """Computes rates from the seconds of a training step."""
     return {
         "actions_per_second": cfg.train.scenes / seconds,
         "physics_steps_per_second": cfg.train.scenes * cfg.sim.substeps / seconds,
@@ -220,13 +194,11 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     state = programs.init(program)
     chunk, compiling = _compile_twice(program, state, steps)
     calls = _stages(program, state)
-    seconds = medians(
-        {**calls, "whole": _whole(chunk, cfg, jax.tree.map(jnp.copy, state))}, repeats
-    )  # it uses it up
-    whole = seconds["whole"] / steps
+    calls["whole"] = _whole(chunk, cfg, jax.tree.map(jnp.copy, state))  # it uses it up
+    seconds = medians(calls, repeats)
+    whole, bare = seconds["whole"] / steps, seconds["bare_loop"]
     stages = {name: seconds[name] for name in _SEPARATE}
     total = sum(stages.values())
-    bare = seconds["bare_loop"]
     return {
         "stage_seconds": stages,
         "stage_shares": {name: value / total for name, value in stages.items()},
@@ -259,36 +231,25 @@ def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dic
     state = programs.init(program)
     chunk, compiling = _compile(program, state, steps)
     seconds = medians({"whole": _whole(chunk, cfg, state)}, repeats)["whole"] / steps
-    return {
-        curve: value,
-        "step_seconds": seconds,
-        **_rates(cfg, seconds),
-        "compile_seconds": compiling,
-    } | _memory(chunk)
+    row = {curve: value, "step_seconds": seconds, "compile_seconds": compiling}
+    return row | _rates(cfg, seconds) | _memory(chunk)
 
 
-def _options(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
-    """Parses the preset, the benchmark's options and the preset's settings."""
+def _parse(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
     parser = Parser(prog="bench step", allow_abbrev=False)
     parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"))
     parser.add_argument("--curve", choices=tuple(CURVES))
     for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
-    if preset not in presets.PRESETS:
-        raise SettingsError(
-            f"bench step: give one preset of: {', '.join(presets.PRESETS)}; or none, for quick"
-        )
     if min(options.steps, options.repeats) < 1:
-        raise SettingsError("bench step: --steps, --repeats: at least 1")
-    if options.curve is None:
-        if options.smallest or options.largest:
-            raise SettingsError("bench step: --smallest and --largest belong to --curve")
-        return preset, options, flags
-    smallest, largest = CURVES[options.curve]
+        parser.error("--steps, --repeats: at least 1")
+    smallest, largest = CURVES.get(options.curve, (0, 0))
     options.smallest, options.largest = options.smallest or smallest, options.largest or largest
-    if not 1 <= options.smallest <= options.largest:
-        raise SettingsError("bench step: --smallest, --largest: 1 <= smallest <= largest is needed")
+    if options.curve and not 1 <= options.smallest <= options.largest:
+        parser.error("--smallest, --largest: 1 <= smallest <= largest is needed")
+    if not options.curve and options.largest + options.smallest:
+        parser.error("--smallest and --largest belong to --curve")
     return preset, options, flags
 
 
@@ -301,36 +262,22 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
     return backend.resolve(cfg.change(sim={"physics": physics}))
 
 
-def _values(smallest: int, largest: int) -> list[int]:
-    return [smallest << i for i in range(32) if smallest << i <= largest]
-
-
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    preset, options, flags = _options(arguments)
+    preset, options, flags = _parse(arguments)
+    curve, steps, repeats = options.curve, options.steps, options.repeats
+    sizes = [options.smallest << i for i in range(32) if options.smallest << i <= options.largest]
     try:
         cfg = _config(preset, flags, options.physics)
-        points = (
-            [_at(cfg, options.curve, v) for v in _values(options.smallest, options.largest)]
-            if options.curve
-            else []
-        )
+        points = {size: _at(cfg, curve, size) for size in sizes if curve}
     except ValueError as error:
         raise SettingsError(f"bench step: {error}") from None
-    result = {
-        "preset": preset,
-        "settings": flags,
-        "physics": cfg.sim.physics,
-        "scenes": cfg.train.scenes,
-    } | {name: getattr(options, name) for name in ("steps", "repeats")}
-    if options.curve:
-        values = _values(options.smallest, options.largest)
-        rows = [
-            _point(p, options.curve, v, options.steps, options.repeats)
-            for p, v in zip(points, values, strict=True)
-        ]
-        result |= {"curve": options.curve, "points": rows}
+    result = {"preset": preset, "settings": flags, "physics": cfg.sim.physics}
+    result |= {"scenes": cfg.train.scenes, "steps": steps, "repeats": repeats}
+    if curve:
+        rows = [_point(point, curve, size, steps, repeats) for size, point in points.items()]
+        result |= {"curve": curve, "points": rows}
     else:
         result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates_per_step}
-        result |= measure(cfg, options.steps, options.repeats)
+        result |= measure(cfg, steps, repeats)
     emit(result)

@@ -8,8 +8,7 @@ them: its compilation and the median of REPEATS (3) rounds after one that is not
 seeds, numbers of seeds that the devices do not divide are left out. Beside a row of one seed on one
 device, `train` is its program as `csac-jax train` has it. `parts` is how many parts the seeds run
 in, see `Pipelined` in csac_jax/sweeps/replicas.py. Configurations follow one another, so that on a
-busy machine ratios are worth less than those of `bench step`. Rows are told on standard error as
-they come.
+busy machine ratios are worth less than those of `bench step`. Rows also go to standard error.
 """
 
 import dataclasses
@@ -43,12 +42,8 @@ def _timed(jitted: Any, state: Any, repeats: int) -> dict[str, Any]:
         state, metrics = chunk(state)
         jax.block_until_ready((state, metrics))
         seconds.append(time.perf_counter() - begun)
-    temporary = chunk.memory_analysis().temp_size_in_bytes
-    return {
-        "compile_seconds": compiled,
-        "seconds": statistics.median(seconds[1:]),
-        "temporary_bytes": temporary,
-    }
+    times = {"compile_seconds": compiled, "seconds": statistics.median(seconds[1:])}
+    return times | {"temporary_bytes": chunk.memory_analysis().temp_size_in_bytes}
 
 
 def measure(
@@ -95,26 +90,17 @@ def main(arguments: list[str]) -> None:
             runner.check_room(most, 1 if options.shard == "scenes" else devices)
     except ValueError as error:
         raise SettingsError(f"bench sweep: {error}") from None
-    program = programs.make(cfg)
-    with_train = 1 in options.seeds and 1 in options.devices
-    alone = (
-        _timed(
-            programs.compile_chunk(program, options.steps), programs.init(program), options.repeats
-        )
-        if with_train
-        else None
-    )
+    program, steps, repeats = programs.make(cfg), options.steps, options.repeats
+    alone = None
+    if 1 in options.seeds and 1 in options.devices:
+        chunk = programs.compile_chunk(program, steps)
+        alone = _timed(chunk, programs.init(program), repeats)
     rows = []
     for devices, seeds in itertools.product(options.devices, options.seeds):
         if options.shard == "scenes" or seeds % devices == 0:
-            row = measure(program, seeds, devices, options.shard, options.steps, options.repeats)
+            row = measure(program, seeds, devices, options.shard, steps, repeats)
             print(f"bench sweep: {json.dumps(row)}", file=sys.stderr)
             rows.append(row)
-    sizes = {
-        "scenes": cfg.train.scenes,
-        "batch": cfg.learn.batch,
-        "steps": options.steps,
-        "shard": options.shard,
-    }
-    sizes |= {"physics": cfg.sim.physics, "settings": flags}
+    sizes = {"scenes": cfg.train.scenes, "batch": cfg.learn.batch, "steps": steps}
+    sizes |= {"shard": options.shard, "physics": cfg.sim.physics, "settings": flags}
     emit({"preset": cfg.preset, **sizes, "train": alone, "rows": rows})

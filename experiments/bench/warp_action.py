@@ -81,7 +81,6 @@ def measure(cfg: Config, longest: float, repeats: int, details: bool) -> dict[st
 
 
 def _differing(one: Any, other: Any) -> int:
-    """Counts leaves that are not equal bit for bit."""
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return sum(a.tobytes() != b.tobytes() for a, b in pairs)
 

@@ -30,24 +30,21 @@ def test_pages_are_as_written():
     assert {run.config["seed"] for run in runs} <= set(range(100, 150))
 
 
-@pytest.mark.parametrize(
-    ("folder", "shown", "there"),
-    [("7-15/scene.drop_extent=0.18:0.18", "1,775", 18), ("7-30/*=0.248:0.248", "2,410", 10)],
-)
-def test_study_counts_actions_until_nine_of_ten_grasps_lift(folder: str, shown: str, there: int):
+def test_study_counts_actions_until_nine_of_ten_grasps_lift():
     """Claim: "actions to 90 %" are the interquartile mean over seeds of the actions at which nine
     of ten of the last 200 grasps first had lifted; a run that never gets there counts whole."""
+    folder = "7-30/scene.drop_extent=0.248:0.248"
     values = study.values(folder, study.ACTIONS, study.FEWER)
-    assert f"{statistics.band([values]).value:,.0f}" == shown
+    assert f"{statistics.band([values]).value:,.0f}" == "2,410"
     archive = index.contents(study.ARCHIVES / "7-clutter.tar.xz")
     good = []
     for name in fnmatch.filter(archive, f"{folder}/*/metrics.jsonl"):
         log = [json.loads(line) for line in archive[name].splitlines()]
         full = [line for line in log if line["grasps_counted"] == 200]
         good.append([line["actions"] for line in full if line["grasp_success"] >= 0.9])
-    assert sum(map(bool, good)) == there
+    assert sum(map(bool, good)) == 10
     firsts = sorted((*one, 2500)[0] for one in good)
-    assert f"{np.mean(firsts[5:15]):,.0f}" == shown
+    assert f"{np.mean(firsts[5:15]):,.0f}" == "2,410"
 
 
 def test_verdicts_by_hand():
