@@ -143,7 +143,7 @@ def test_plan_survives_its_file(tmp_path: Path):
     content = json.loads(path.read_text())
     del content["sha256"]
     path.write_text(json.dumps({**content, "episodes": "7"}))
-    with pytest.raises(runner.SweepError, match="--evaluate: 0 to"):
+    with pytest.raises(runner.SweepError, match="episodes: 0 to"):
         command.read(["--resume", str(tmp_path)])
 
 
