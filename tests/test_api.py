@@ -61,15 +61,14 @@ def _policy(path: Path, cfg: Config) -> Params:
     return params
 
 
-def _assert_same(found: Any, wanted: Any) -> None:
-    assert jax.tree.structure(found) == jax.tree.structure(wanted)
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
 def _equal(one: Any, other: Any) -> bool:
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(np.array_equal(*pair) for pair in pairs)
+
+
+def _assert_same(one: Any, other: Any) -> None:
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    assert _equal(one, other)
 
 
 def _assert_starts_from(state: LearnerState, params: Params, fresh: LearnerState) -> None:
@@ -82,7 +81,7 @@ def _assert_starts_from(state: LearnerState, params: Params, fresh: LearnerState
     assert int(state.updates) == 0
 
 
-@pytest.mark.parametrize("seeds", [None, 2, 3])
+@pytest.mark.parametrize("seeds", [None, 3])
 def test_first_states_have_the_networks_of_the_policy(tmp_path: Path, seeds: int | None):
     """Claim: `init` puts a policy's networks into online and target ones of a run, or of each run
     of a sweep, whose states have an axis of runs; the optimisers are those of a fresh run."""
@@ -125,9 +124,7 @@ _TARGET = {"task": {"kind": "target"}}
     "changes",
     [
         {"net": {"growth": 8}},
-        {"net": {"dilations": (1, 2, 1)}},
         {"net": {"colour": False}},
-        {"learn": {"critics": 2}},
         {"learn": {"critics": 2}} | _TARGET,
         pytest.param(_DENSENET | _TARGET, marks=pytest.mark.slow),
     ],
@@ -166,13 +163,6 @@ def test_weights_that_cannot_be_read_are_refused(tmp_path: Path):
         api.initial_networks(cfg, path)
     assert "\n" not in str(caught.value)
     assert api.match_networks(cfg, path) == cfg
-
-
-def _stopped() -> Stop:
-    """As after a signal that came before the first chunk: a run saves its first state."""
-    stop = Stop()
-    stop.signal = 15
-    return stop
 
 
 def _saved(run: api.Run) -> step.TrainState:
@@ -241,9 +231,10 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     """Claim: a run with `init` begins with the last networks of that run, in scenes of its own
     seed, and its optimisers are fresh."""
     run, _ = trained
-    cfg = SMOKE.change(seed=1)
+    cfg, stop = SMOKE.change(seed=1), Stop()
+    stop.signal = 15  # before the first chunk: a run saves its first state
     plain, begun = (
-        api.train(cfg, tmp_path / name, init=init, stop=_stopped(), verbose=False)
+        api.train(cfg, tmp_path / name, init=init, stop=stop, verbose=False)
         for name, init in (("plain", None), ("begun", run.run_dir))
     )
     assert (begun.summary.step, begun.summary.stopped_by) == (0, 15)
@@ -253,40 +244,34 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     _assert_same(state.scenes, fresh.scenes)
 
 
-class Sweeps:
-    """Stands in for `runner.run`: keeps what it is called with."""
+@pytest.fixture
+def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
+    """What a sweep that trains no run is called with; folders are made in `tmp_path`."""
+    called: list[Any] = []
 
-    def __init__(self) -> None:
-        self.called: list[Any] = []
-
-    def __call__(self, plan, folder, make_program, reporter, stop, resume=False) -> SweepResult:
-        self.called.append((plan, folder, make_program, stop))
+    def run(plan, folder, make_program, reporter, stop, resume=False) -> SweepResult:
+        called.append((plan, folder, make_program, stop))
         return SweepResult({"seeds": plan.seeds}, [], None)
 
-
-@pytest.fixture
-def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Sweeps:
-    """A sweep that trains no run; folders are made in `tmp_path`."""
-    stub = Sweeps()
-    monkeypatch.setattr(api.runner, "run", stub)
+    monkeypatch.setattr(api.runner, "run", run)
     monkeypatch.chdir(tmp_path)
-    return stub
+    return called
 
 
-def test_sweep_has_every_combination(sweeps: Sweeps, capsys: pytest.CaptureFixture):
+def test_sweep_has_every_combination(sweeps: list[Any], capsys: pytest.CaptureFixture):
     """Claim: `sweep` runs every combination of the values, algorithms before settings, and returns
     the summary; it says which folder it takes, unless told not to. With nothing to vary there is
     one point; folder and stop are the caller's."""
     mine = Stop()
     api.sweep(SMOKE, run_dir="mine", stop=mine, verbose=False)
-    ((plan, folder, _, stop),) = sweeps.called
+    ((plan, folder, _, stop),) = sweeps
     assert (plan.seeds, [point.cfg for point in plan.points]) == (4, [SMOKE])
     assert (folder, stop) == (Path("mine"), mine)
     assert capsys.readouterr().out == ""
-    sweeps.called.clear()
+    sweeps.clear()
     vary = {"learn.tau": (0.1, 0.2), "algo": ("csac", "vpg"), "replay.capacity": (128,)}
     assert api.sweep(SMOKE.change(seed=3), 2, vary) == {"seeds": 2}
-    ((plan, folder, _, stop),) = sweeps.called
+    ((plan, folder, _, stop),) = sweeps
     assert (plan.seeds, stop.signal) == (2, None)
     assert folder.parent == Path("runs")
     assert folder.name.startswith("sweep-smoke-20")
@@ -301,7 +286,7 @@ def test_sweep_has_every_combination(sweeps: Sweeps, capsys: pytest.CaptureFixtu
         assert point.cfg == wanted.change(learn={"tau": tau}, replay={"capacity": 128})
 
 
-def test_sweep_decides_on_physics(sweeps: Sweeps, monkeypatch: pytest.MonkeyPatch):
+def test_sweep_decides_on_physics(sweeps: list[Any], monkeypatch: pytest.MonkeyPatch):
     """Claim: `auto` is resolved for all runs together before they are planned."""
     asked = []
 
@@ -311,19 +296,19 @@ def test_sweep_decides_on_physics(sweeps: Sweeps, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(api.backend, "resolve", resolve)
     api.sweep(presets.quick(), 3, {"learn.tau": (0.1, 0.2)}, verbose=False)
-    ((plan, *_),) = sweeps.called
+    ((plan, *_),) = sweeps
     assert asked == [(1, 6)] * 2
     assert {point.cfg.sim.physics for point in plan.points} == {"c"}
 
 
 @pytest.mark.mjx
-def test_runs_of_a_sweep_start_from_a_policy(sweeps: Sweeps, tmp_path: Path, monkeypatch):
+def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, monkeypatch):
     """Claim: `init` is where each run of a sweep starts from, the learners of all groups."""
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
     given = []
     monkeypatch.setattr(api.replicas, "sweep_program", lambda *args: given.append(args))
     api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", verbose=False)
-    ((plan, _, make_program, _),) = sweeps.called
+    ((plan, _, make_program, _),) = sweeps
     (group,) = group_configs([dataclasses.replace(plan.points[0].cfg, seed=k) for k in range(2)])
     make_program(group)
     ((asked, mesh, shard, start),) = given
@@ -342,9 +327,9 @@ def test_runs_of_a_sweep_start_from_a_policy(sweeps: Sweeps, tmp_path: Path, mon
         ({"devices": 10_000}, r"devices: 10000 asked for"),
     ],
 )
-def test_sweep_refuses_what_cannot_be(sweeps: Sweeps, arguments: dict[str, Any], message: str):
+def test_sweep_refuses_what_cannot_be(sweeps: list[Any], arguments: dict[str, Any], message: str):
     """Claim: a sweep that cannot be is a ValueError of one line, before anything starts."""
     with pytest.raises(ValueError, match=message) as caught:
         api.sweep(SMOKE, **arguments, verbose=False)
     assert "\n" not in str(caught.value)
-    assert sweeps.called == []
+    assert sweeps == []

@@ -19,11 +19,7 @@ from csac_jax.io import policy_file
 pytestmark = pytest.mark.mjx
 
 SMOKE = presets.smoke()
-CFG = dataclasses.replace(
-    SMOKE,
-    policy=dataclasses.replace(SMOKE.policy, primitive="rule"),
-    sim=dataclasses.replace(SMOKE.sim, physics="c"),
-)
+CFG = SMOKE.change(policy={"primitive": "rule"}, sim={"physics": "c"})
 SCENES = 3
 
 
@@ -129,10 +125,8 @@ def test_failures_lead_to_other_places(learned, states):
     """Claim: with `policy.retry_temperature` an action after failed grasps is drawn, another for
     another key; without failures, or from an observation, it is the best one."""
     greedy = CFG.change(policy={"place": "argmax"})
-    learned, bold = (
-        dataclasses.replace(learned, cfg=cfg)
-        for cfg in (greedy, greedy.change(policy={"retry_temperature": 10.0}))
-    )
+    cfgs = (greedy, greedy.change(policy={"retry_temperature": 10.0}))
+    learned, bold = (dataclasses.replace(learned, cfg=cfg) for cfg in cfgs)
     state, key = _scene(states, 0), jax.random.key
     failed = state.replace(failed_grasps=jnp.int32(3))
     for seen in (state, failed.obs):

@@ -43,29 +43,21 @@ class Magnet(Env):
     def step(self, state: State, action: Action) -> State:
         off = jnp.linalg.norm(state.scene.position[:, :2] - action.pose[None, :2], axis=1)
         taken = state.scene.in_play & (off < self.reach) & (action.primitive == Primitive.GRASP)
-        scene = scene_state.park(state.scene, ~taken)
-        actions, steps_without_change = (
-            state.actions + 1,
-            jnp.where(jnp.any(taken), 0, state.steps_without_change + 1),
-        )
-        terminated = ~jnp.any(scene.in_play)
-        capped = (actions >= self.cfg.task.max_actions) | (
-            steps_without_change >= self.cfg.task.max_steps_without_change
-        )
-        outcome = jnp.where(jnp.any(taken), jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
+        scene, took = scene_state.park(state.scene, ~taken), jnp.any(taken)
+        actions, idle = state.actions + 1, jnp.where(took, 0, state.steps_without_change + 1)
+        terminated, task = ~jnp.any(scene.in_play), self.cfg.task
+        capped = (actions >= task.max_actions) | (idle >= task.max_steps_without_change)
+        outcome = jnp.where(took, jnp.int32(Outcome.LIFTED), jnp.int32(Outcome.EMPTY))
+        cleared, moved = jnp.sum(taken, dtype=jnp.int32), jnp.where(took, 25.0, 0.0)
         return state.replace(
             scene=scene,
             obs=observe.observe(self.cfg, scene),
             terminated=terminated,
             truncated=capped & ~terminated,
             actions=actions,
-            steps_without_change=steps_without_change,
-            reward=jnp.any(taken).astype(jnp.float32),
-            info=state.info.replace(
-                outcome=outcome,
-                cleared=jnp.sum(taken, dtype=jnp.int32),
-                moved=jnp.where(jnp.any(taken), 25.0, 0.0),
-            ),
+            steps_without_change=idle,
+            reward=took.astype(jnp.float32),
+            info=state.info.replace(outcome=outcome, cleared=cleared, moved=moved),
         )
 
 
@@ -105,21 +97,16 @@ def random(magnet) -> Episodes:
 
 def assert_consistent(episodes: Episodes, max_actions: int) -> None:
     """What holds of every record of episodes."""
-    actions = episodes.valid.sum(axis=1)
-    np.testing.assert_array_equal(
-        episodes.valid, np.arange(max_actions)[None] < actions[:, None]
-    )  # a prefix
+    same, (valid, taken) = np.testing.assert_array_equal, (episodes.valid, episodes.cleared)
+    actions = valid.sum(axis=1)
+    same(valid, np.arange(max_actions)[None] < actions[:, None])  # a prefix
     assert np.all(actions >= 1)
-    assert not np.any(episodes.cleared[~episodes.valid])
-    taken = episodes.cleared.sum(axis=1)
-    np.testing.assert_array_equal(
-        (taken + episodes.blocks_lost == episodes.blocks), episodes.completed
-    )
-    assert np.all(taken + episodes.blocks_lost <= episodes.blocks)
-    grasps = episodes.valid & (episodes.primitive == Primitive.GRASP)
-    np.testing.assert_array_equal(
-        (episodes.cleared > 0), grasps & (episodes.outcome == Outcome.LIFTED)
-    )
+    assert not np.any(taken[~valid])
+    gone = taken.sum(axis=1) + episodes.blocks_lost
+    same(gone == episodes.blocks, episodes.completed)
+    assert np.all(gone <= episodes.blocks)
+    grasps = valid & (episodes.primitive == Primitive.GRASP)
+    same(taken > 0, grasps & (episodes.outcome == Outcome.LIFTED))
 
 
 def _blocks(env: Env) -> np.ndarray:
@@ -148,12 +135,11 @@ def test_random_episodes_end_at_the_caps(magnet, random):
     assert_consistent(random, CFG.task.max_actions)
     assert random.valid.shape == (EPISODES, CFG.task.max_actions)
     assert not np.all(random.completed)
+    most = CFG.task.max_steps_without_change
     for i, (cleared, valid) in enumerate(zip(random.cleared, random.valid, strict=True)):
         num = valid.sum()
-        steps_without_change = num >= CFG.task.max_steps_without_change and not np.any(
-            cleared[num - CFG.task.max_steps_without_change : num]
-        )
-        capped = 1 if num == CFG.task.max_actions else 2 if steps_without_change else None
+        idle = num >= most and not np.any(cleared[num - most : num])
+        capped = 1 if num == CFG.task.max_actions else 2 if idle else None
         assert random.ending[i] == (0 if random.completed[i] else capped)
     np.testing.assert_array_equal(random.changed & random.valid, random.cleared > 0)
     assert not random.wrong.any()
@@ -191,16 +177,6 @@ def test_endings_by_hand(magnet):
     short = Magnet(cfg, magnet.physics, magnet.scenes)
     episodes = rollout.rollout(short, OraclePolicy(cfg), EPISODES, 0)
     np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))
-
-
-@pytest.mark.slow
-def test_more_episodes_than_run_at_once(magnet, monkeypatch):
-    """Claim: episodes beyond those that run side by side follow in order, each from its own
-    scene."""
-    monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
-    episodes = rollout.rollout(magnet, ORACLE, EPISODES, 0)
-    np.testing.assert_array_equal(episodes.blocks, _blocks(magnet))
-    assert np.all(episodes.completed)
 
 
 @pytest.mark.slow
@@ -278,10 +254,8 @@ def test_evaluate_gives_metrics(magnet, monkeypatch):
     """Claim: the metrics of one part come as they are, of several by their names; our policies act
     in the world of each part's environment, whatever their own config's is."""
     elsewhere = OraclePolicy(presets.quick())
-    monkeypatch.setitem(suites.SUITES, "one", suites.Suite(lambda *_: {"a": magnet}, 1))
-    monkeypatch.setitem(
-        suites.SUITES, "two", suites.Suite(lambda *_: {"a": magnet, "b": magnet}, 1)
-    )
+    for name, parts in (("one", {"a": magnet}), ("two", {"a": magnet, "b": magnet})):
+        monkeypatch.setitem(suites.SUITES, name, suites.Suite(lambda *_, parts=parts: parts))
     told = []
     one = rollout.evaluate(elsewhere, "one", EPISODES, on_progress=lambda *at: told.append(at))
     two = rollout.evaluate(elsewhere, "two", EPISODES)
@@ -292,19 +266,14 @@ def test_evaluate_gives_metrics(magnet, monkeypatch):
     assert random == rollout.evaluate(RANDOM, "one", EPISODES)
 
 
-@pytest.mark.parametrize("physics", ["c", "mjx"])
-def test_physics_that_are_named_are_taken(physics: str, monkeypatch):
-    """Claim: physics that are named are taken; `auto` is the one of this machine."""
-    monkeypatch.setitem(suites.SUITES, "none", suites.Suite(lambda *_: {}, 1))
-    got = suites.prepare(CFG, "none", physics=physics, robot="ur5").cfg
-    assert (got.sim.physics, got.sim.robot) == (physics, "ur5")
-    assert dataclasses.replace(got, sim=CFG.sim) == CFG
-
-
-def test_auto_is_c_on_a_cpu(monkeypatch):
-    """Claim: on a CPU an evaluation computes physics by C MuJoCo, unless another is named."""
+def test_physics_that_are_named_are_taken(monkeypatch):
+    """Claim: physics that are named are taken; `auto` is C MuJoCo on a CPU."""
+    monkeypatch.setitem(suites.SUITES, "none", suites.Suite(lambda *_: {}))
+    for physics in ("c", "mjx"):
+        got = suites.prepare(CFG, "none", physics=physics, robot="ur5").cfg
+        assert (got.sim.physics, got.sim.robot) == (physics, "ur5")
+        assert dataclasses.replace(got, sim=CFG.sim) == CFG
     wanted = "c" if jax.default_backend() == "cpu" else "mjx"
-    monkeypatch.setitem(suites.SUITES, "none", suites.Suite(lambda *_: {}, 1))
     assert suites.prepare(presets.get("fast"), "none").cfg.sim.physics == wanted
 
 

@@ -22,7 +22,7 @@ def _python(*arguments: str, **options: Any) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *arguments], env=env, **pipes, **options)
 
 
-@pytest.mark.parametrize("arguments", [["train", "smoke"], ["sweep", "smoke"], ["doctor"]])
+@pytest.mark.parametrize("arguments", [["train", "smoke"], ["doctor"]])
 def test_device_that_is_not_there_is_one_line(arguments: list[str], tmp_path: Path):
     """Claim: a command whose JAX_PLATFORMS names no device of this machine ends with one line and
     exit code 2, and writes nothing."""

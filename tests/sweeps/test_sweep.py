@@ -129,22 +129,16 @@ def test_every_run_is_one_of_train(uninterrupted):
 
 
 def test_group_is_compiled_once(uninterrupted):
-    """Claim: points that differ in numbers are one group, and a group is compiled once; the
-    others have their own."""
-    _, _, programs, result = uninterrupted
+    """Claim: points that differ in numbers are one group, compiled once; the others have their own.
+    Of a group that is done the mark alone is left. Lines show actions of all runs of all points."""
+    folder, listener, programs, result = uninterrupted
     names = [[cfg.replay.sampler for cfg in group.configs] for group in programs.groups]
     assert names == [[CFG.replay.sampler] * 4, ["uniform"] * 2]
     assert programs.groups[0].hyperparams == ("learn.tau",)
     assert programs.compiled == len(result.compile_seconds) == 2
-
-
-def test_groups_make_room(uninterrupted):
-    """Claim: once its runs are saved, nothing is left of a group but the mark that it is done. A
-    line is shown per chunk, whose actions grow to those of all runs of all points."""
-    folder, listener, *_ = uninterrupted
     left = [path for path in (folder / "groups").rglob("*") if path.is_file()]
     assert sorted(left) == [folder / "groups" / str(k) / "done" for k in range(2)]
-    actions = [record.actions for record in listener.records]
+    actions = [record.actions for record in listener.records]  # shown a line per chunk
     assert actions == [*range(48, 289, 48), *range(312, 433, 24)]
 
 

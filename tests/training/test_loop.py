@@ -160,14 +160,13 @@ def test_run_ends_complete(tmp_path: Path):
 def test_saves_on_the_way(tmp_path: Path):
     """Claim: steps are rounded up to whole chunks; every `save_every` chunks a run saves."""
     assert loop.total_steps(CFG.change(train={"actions": 73})) == 28
-    saved = []
-    listener = Listener()
+    saved, listener = [], Listener()
     listener.progress = lambda *_: saved.append(checkpoint.latest_step(tmp_path / "run"))
     _run(tmp_path / "run", listener, Fake())
     assert saved == [None, None, 8, 8, 16, 16]  # as seen before the save of the same chunk
 
 
-@pytest.mark.parametrize("stop_after", [0, 1, 3, 5, 6])
+@pytest.mark.parametrize("stop_after", [0, 1, 5, 6])
 def test_resumed_run_ends_as_the_uninterrupted_one(tmp_path: Path, whole: Path, stop_after: int):
     """Claim: a run that is stopped and resumed ends bit for bit as one that is not, with the same
     log but for times."""
@@ -182,6 +181,9 @@ def test_resumed_run_ends_as_the_uninterrupted_one(tmp_path: Path, whole: Path, 
     assert (summary.step, summary.stopped_by) == (24, None)
     assert _final(tmp_path / "run") == _final(whole)
     assert _log(tmp_path / "run") == _log(whole)
+    fake = Fake()  # a complete run compiles nothing
+    assert _run(tmp_path / "run", Listener(), fake, resume=True).step == 24
+    assert (fake.compiled, _final(tmp_path / "run")) == ([], _final(whole))
 
 
 def test_lines_newer_than_the_checkpoint_are_dropped(tmp_path: Path, whole: Path):
@@ -198,22 +200,11 @@ def test_lines_newer_than_the_checkpoint_are_dropped(tmp_path: Path, whole: Path
     assert [round(before, 3), *seconds] == sorted([round(before, 3), *seconds])
 
 
-def test_complete_run_resumed_does_nothing(tmp_path: Path):
-    """Claim: resuming a complete run compiles nothing and changes nothing."""
-    _run(tmp_path / "run", Listener(), Fake())
-    before, fake = _final(tmp_path / "run"), Fake()
-    assert _run(tmp_path / "run", Listener(), fake, resume=True).step == 24
-    assert fake.compiled == []
-    assert _final(tmp_path / "run") == before
-
-
 @pytest.mark.parametrize(
     ("fault", "step", "message"),
     [
         ("nan_at", 9, "critic_loss is not finite.*step 8 is kept.*learning_rate"),
-        ("nan_at", 21, "critic_loss is not finite.*step 16 is kept"),
         ("lost_at", 2, "a parameter is not finite"),  # in the warm-up
-        ("lost_at", 21, "a parameter is not finite"),
     ],
 )
 def test_what_is_not_finite_stops_the_run(tmp_path: Path, fault: str, step: int, message: str):
@@ -255,14 +246,13 @@ def test_warnings_come_once(tmp_path: Path):
 def test_bad_folders(tmp_path: Path):
     """Claim: a new run never writes into a folder that exists; one without a checkpoint cannot be
     resumed."""
-    with pytest.raises(FileExistsError):
-        _run(tmp_path, Listener(), Fake())
-    assert list(tmp_path.iterdir()) == []
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        _run(tmp_path, Listener(), Fake(), resume=True)
+    for resume, error in ((False, FileExistsError), (True, CheckpointError)):
+        with pytest.raises(error):
+            _run(tmp_path, Listener(), Fake(), resume=resume)
+        assert resume or list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("stop_after", [1, 3, None])
+@pytest.mark.parametrize("stop_after", [3, None])
 def test_resumed_with_more_actions_ends_as_the_longer_run(tmp_path: Path, stop_after: int):
     """Claim: a stopped or complete run that is resumed with more `train.actions` ends bit for bit
     as one that had them from the start; its folder holds the new number, and can be resumed."""
@@ -282,7 +272,6 @@ def test_resumed_with_more_actions_ends_as_the_longer_run(tmp_path: Path, stop_a
 @pytest.mark.parametrize(
     ("changes", "named"),
     [
-        ({"learn": {"tau": 0.5}}, "learn.tau"),
         ({"learn": {"tau": 0.5}, "train": {"actions": 96}}, "learn.tau"),
         ({"train": {"actions": 60}}, "train.actions"),
         ({"train": {"actions": 96, "save_every": 3}}, "train.save_every"),
@@ -303,20 +292,13 @@ def test_resume_needs_the_same_config(tmp_path: Path, changes: dict[str, Any], n
     assert (_final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()) == before
 
 
-def _metrics(primitive: list[int], outcome: list[int]) -> Any:
-    """One scene, T steps."""
-    steps = [
-        step_metrics(1, primitive=np.array([made]), outcome=np.array([came]))
-        for made, came in zip(primitive, outcome, strict=True)
-    ]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
-
-
 def test_success_is_over_the_last_200_grasps():
     """Claim: grasp success is over the last 200 grasps, pushes not counted, oldest dropped
     first."""
     before = loop.LoopState(0.0, [1] * 150 + [0] * 49)  # 199 grasps
-    metrics = _metrics(primitive=[1, 0, 1, 1], outcome=[4, 4, 3, 4])
+    done = zip([1, 0, 1, 1], [4, 4, 3, 4], strict=True)  # primitive and outcome of one scene
+    steps = [step_metrics(1, primitive=np.array([a]), outcome=np.array([b])) for a, b in done]
+    metrics = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
     after, record = loop.record_chunk(CFG, 4, metrics, before, 0.5)
     assert after.grasps == [1] * 148 + [0] * 49 + [1, 0, 1]
     assert (record.grasp_success, record.grasps_counted) == (150 / 200, 200)

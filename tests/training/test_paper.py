@@ -12,13 +12,12 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.config import Config, DenseNet121
-from csac_jax.env import Env
 from csac_jax.io import checkpoint
 from csac_jax.nets import chunked_vmap
 from csac_jax.sweeps import replicas
 from csac_jax.training import programs, step
 from tests.sweeps.test_replicas import assert_close
-from tests.training.test_step import assert_same, copy, equal, leaves
+from tests.training.test_step import Still, assert_same, copy, equal, leaves
 
 pytestmark = pytest.mark.mjx
 TRUNK = 7_037_504
@@ -32,13 +31,6 @@ class Tiny(DenseNet121):
 
 
 TINY = Tiny(rotations=4, pad_fraction=0.0, head=8, upsample=2)
-
-
-class Still(Env):
-    """The environment without physics: compiles fast."""
-
-    def step(self, state, action):
-        return state.replace(actions=state.actions + 1)
 
 
 def _still(cfg: Config) -> step.Program:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -200,25 +200,13 @@ def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch,
     assert not is_split(run.program)
 
 
-def primitives(jaxpr: Any) -> Iterator[str]:
-    """Names of all primitives, those of nested programs too."""
-    for equation in jaxpr.eqns:
-        yield equation.primitive.name
-        for value in jax.tree.leaves(
-            equation.params, is_leaf=lambda v: hasattr(v, "eqns") or hasattr(v, "jaxpr")
-        ):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from primitives(inner)
-
-
 def test_chunk_does_not_speak_to_the_host(run):
     """Claim: no callback, no feed and no transfer in the compiled chunk, at any depth."""
-    names = set(primitives(run.traced.jaxpr.jaxpr))
-    assert {"scan", "while", "conv_general_dilated", "sort"} <= names  # it was searched in depth
-    assert not {name for name in names if any(word in name for word in HOST)}
     loud = jax.make_jaxpr(jax.vmap(jax.jit(lambda x: jax.debug.print("{x}", x=x))))(jnp.ones(2))
-    assert any(word in name for name in primitives(loud.jaxpr) for word in HOST)
+    quiet, spoken = (str(jaxpr) for jaxpr in (run.traced.jaxpr, loud))  # nested programs too
+    assert all(f" {name}[" in quiet for name in ("scan", "while", "conv_general_dilated", "sort"))
+    assert not any(word in quiet for word in HOST)
+    assert any(word in spoken for word in HOST)
 
 
 def test_replay_is_updated_in_place(run):
@@ -238,8 +226,8 @@ class Still(Env):
         return state.replace(actions=state.actions + 1)
 
 
-class Losing(Env):
-    """The environment without physics, in which every action drives a block out."""
+class Losing(Still):
+    """It drives a block out with every action."""
 
     def step(self, state, action):
         return state.replace(info=state.info.replace(blocks_lost=jnp.int32(1)))
@@ -257,22 +245,6 @@ def test_blocks_that_left_reach_the_reward(run):
     push = rewards.scale(reward, reward.push_level) * reward.push_levels[0] - 0.75
     wanted = np.where(metrics.primitive == Primitive.GRASP, grasp, push)
     np.testing.assert_allclose(metrics.reward, wanted, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_temporary_memory_does_not_grow_with_the_ring():
-    """Claim: four times the ring needs hardly more temporary memory, a fiftieth of the difference
-    at most."""
-    temporary, rings = [], []
-    for capacity in (512, 2048):
-        program = programs.make(CFG.change(replay={"capacity": capacity}))
-        env = Still(program.env.cfg, program.env.physics, program.env.scenes)
-        program = dataclasses.replace(program, env=env)
-        state = programs.init(program)
-        compiled = programs.compile_chunk(program, T).lower(state).compile()
-        temporary.append(compiled.memory_analysis().temp_size_in_bytes)
-        rings.append(sum(leaf.nbytes for leaf in jax.tree.leaves(state.replay)))
-    assert temporary[1] - temporary[0] < (rings[1] - rings[0]) / 50
 
 
 def test_same_seed_gives_the_same_run(run):
@@ -369,14 +341,13 @@ def test_actions_out_of_reach_are_counted(run):
 def test_finished_scenes_are_replaced(run):
     """Claim: a scene that is cut off gives way to a fresh one, with no actions taken; its last
     transition is stored as not terminated, so that it bootstraps. The other scene goes on."""
-    scenes = run.states[0].scenes
-    near_end = scenes.replace(actions=jnp.array([CFG.task.max_actions - T, 0], jnp.int32))
-    state, metrics = run.chunk(copy(run.states[0].replace(scenes=near_end)))
+    near_end = jnp.array([CFG.task.max_actions - T, 0], jnp.int32)
+    scenes = run.states[0].scenes.replace(actions=near_end)
+    state, metrics = run.chunk(copy(run.states[0].replace(scenes=scenes)))
     ended = np.asarray(metrics.terminated | metrics.truncated)
     assert ended[:, 0].any()
-    for scene in range(CFG.train.scenes):
-        ends = np.flatnonzero(ended[:, scene])
-        since = T - 1 - ends[-1] if ends.size else T + int(near_end.actions[scene])
+    for scene, ends in enumerate(map(np.flatnonzero, ended.T)):
+        since = T - 1 - ends[-1] if ends.size else T + int(near_end[scene])
         assert state.scenes.actions[scene] == since
     assert not np.any(state.scenes.terminated | state.scenes.truncated)
     if metrics.truncated[-1, 0]:

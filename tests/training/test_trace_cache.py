@@ -52,26 +52,20 @@ def program() -> Program:
     return programs.make(CFG)
 
 
-def _shapes(program: Program) -> Any:
+@pytest.fixture(scope="module")
+def shapes(program: Program) -> Any:
     return jax.eval_shape(programs.compile_init(program))
 
 
 def _untraceable() -> Any:
-    failing = {"side_effect": TracedError}
-    act = mock.create_autospec(step.act_half, **failing)
-    learn = mock.create_autospec(step.learn_half, **failing)
-    return mock.patch.multiple(step, act_half=act, learn_half=learn)
+    halves = {"act_half": step.act_half, "learn_half": step.learn_half}
+    failing = {k: mock.create_autospec(v, side_effect=TracedError) for k, v in halves.items()}
+    return mock.patch.multiple(step, **failing)
 
 
-def _lower(program: Program, shapes: Any) -> None:
-    """Lowers the half that acts."""
-    trace_cache.jit(program, step.act_half, cached=True).lower(shapes)
-
-
-def test_cached_program_is_the_same(folder: Path, program: Program):
+def test_cached_program_is_the_same(folder: Path, program: Program, shapes: Any):
     """Claim: a program of another seed, in a process that has not traced it, is lowered without a
     trace, calls the physics of its own world, and computes the same bits as one that is traced."""
-    shapes = _shapes(program)
     plain = split_step.compile_chunk(program, T).lower(shapes).compile()
     split_step.compile_chunk(program, T, cached=True).lower(shapes).compile()
     other = programs.make(dataclasses.replace(CFG, seed=3))
@@ -85,19 +79,22 @@ def test_cached_program_is_the_same(folder: Path, program: Program):
     assert len(list(folder.iterdir())) == 2
 
 
-def test_damaged_program_is_traced_again(folder: Path, program: Program):
+def test_damaged_program_is_traced_again(folder: Path, program: Program, shapes: Any):
     """Claim: a file with a flipped bit is not used, and replaced by a sound one."""
-    shapes = _shapes(program)
-    _lower(program, shapes)
+
+    def lower() -> None:
+        trace_cache.jit(program, step.act_half, cached=True).lower(shapes)
+
+    lower()
     (path,) = folder.iterdir()
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with _untraceable(), pytest.raises(TracedError):
-        _lower(program, shapes)
-    _lower(program, shapes)
+        lower()
+    lower()
     with _untraceable():
-        _lower(program, shapes)
+        lower()
 
 
 def _name(cfg: Config = CFG, half: str = "act_half", **env: Any) -> str:
