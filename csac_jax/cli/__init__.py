@@ -1,5 +1,4 @@
-"""The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped by
-SIGINT and SIGTERM.
+"""The command `csac-jax`. Exit codes: 0 done, 1 failed, 2 bad arguments, 130 and 143 stopped.
 
 Each command has a file, whose `run` takes its arguments and returns the exit code. JAX is imported
 only after the arguments are checked, so that help and errors come at once.
@@ -37,7 +36,6 @@ from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import files
 
-_OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # XLA's name for it
 _LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or raise --devices"
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
@@ -112,11 +110,11 @@ def _warner() -> Callable[..., None]:
     """Returns a function that prints each different warning once, in one line."""
     printed = set()
 
-    def warn(message: object, category: type[Warning], *place: Any, **more: Any) -> None:
-        line = f"{PROGRAM}: warning: {' '.join(str(message).split())}"
+    def warn(message: object, *_: Any, **__: Any) -> None:
+        line = " ".join(str(message).split())
         if line not in printed:
             printed.add(line)
-            print(line, file=sys.stderr)
+            complain(0, f"warning: {line}")
 
     return warn
 
@@ -149,10 +147,10 @@ def _dispatch(arguments: list[str]) -> int:
         from csac_jax.runtime import devices
 
         devices.require()  # JAX may have started without a device
-        if _OUT_OF_MEMORY in str(error):
-            reason = files.first_line(error)
-            raise FailedError(f"the device is out of memory; {_LESS} ({reason})") from None
-        raise
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        text = f"the device is out of memory; {_LESS} ({files.first_line(error)})"
+        raise FailedError(text) from None
 
 
 def _on_device(arguments: list[str]) -> list[str]:

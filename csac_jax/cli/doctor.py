@@ -52,25 +52,21 @@ def run(arguments: list[str]) -> int:
 
 
 def _read(arguments: list[str]) -> tuple[DoctorOptions | train.TrainOptions, Config | None]:
-    """Returns the options, and with --preset the config of such a run."""
+    """Returns the options, and with --preset or --build the config of such a run."""
     preset, others = parsing.take(arguments, "--preset")
     build, others = "--build" in others, [flag for flag in others if flag != "--build"]
     if parsing.asks_help(arguments) or (preset is None and not build):
         return parsing.parse(DoctorOptions, arguments, "doctor"), None
     options, cfg = train.read([preset or "fast", *others])
-    return options, _on_warp(cfg) if build else cfg
-
-
-def _on_warp(cfg: Config) -> Config:
-    """Returns the config with the physics of this machine. Raises SettingsError without Warp."""
+    if not build:
+        return options, cfg
     from csac_jax.sim import backend
 
     cfg = backend.resolve(cfg)
-    if cfg.sim.physics != "warp":
-        raise SettingsError(
-            f"--build: only warp has kernels to build, and sim.physics is {cfg.sim.physics} here"
-        )
-    return cfg
+    if (physics := cfg.sim.physics) != "warp":
+        text = f"only warp has kernels to build, and sim.physics is {physics} here"
+        raise SettingsError(f"--build: {text}")
+    return options, cfg
 
 
 def _build_kernels(cfg: Config) -> dict[str, Any]:

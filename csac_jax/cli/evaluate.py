@@ -1,5 +1,6 @@
 """`csac-jax eval`: a policy, measured in one suite or in several."""
 
+import collections
 import dataclasses
 import functools
 import hashlib
@@ -57,14 +58,11 @@ class EvalOptions:
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """What moves the gripper: nothing, it floats as in training; or an arm."""
     augment: Literal["on", "off"] | None = None
-    """Whether Q is the mean over mirror images of the view, see `policy.augment` of `csac-jax train
-    --help-all`; by default as the policy's."""
+    """Decide by the mean Q over mirror images of the view; by default as the policy does."""
     height_bonus: float | None = None
-    """What each metre of the surface under a cell adds to Q, see `policy.height_bonus` of `csac-jax
-    train --help-all`; by default as the policy's."""
+    """Q that each metre of the surface under a cell adds; by default the policy's."""
     retry_temperature: float | None = None
-    """Temperature of the draw of another place after failed grasps, see `csac-jax train
-    --help-all`; by default as the policy's."""
+    """Temperature of the draw of another place after failed grasps; by default the policy's."""
     episodes: int | None = None
     """Episodes of every part of a suite; by default 50, with --out the suite's own number."""
     share: float = 1.0
@@ -83,15 +81,13 @@ def run(arguments: list[str]) -> int:
         return _evaluate_sweep(options, view)
     changes = {**view, "policy": settings.decision(options)}
     if options.out is not None:
-        return _measure_all(options, changes)
+        return _measure_all(options, changes, options.out)
     (suite,) = options.suites
     with output.progress() as bars:
         result = _measure(_shown(bars), options, changes, suite, options.episodes or EPISODES)
     for part, summary in result.get("parts", {Path(suite).stem: result}).items():
-        title = (
-            f"{options.policy} policy, {part}: {result['episodes']} episodes, seed {options.seed}"
-        )
-        print_summary(title, summary)
+        number = f"{result['episodes']} episodes, seed {options.seed}"
+        print_summary(f"{options.policy} policy, {part}: {number}", summary)
     if options.json is not None:
         files.write_json(options.json, result)
     return 0
@@ -114,9 +110,11 @@ def _check(options: EvalOptions) -> None:
 
 def _which(text: str) -> Any:
     """Reads `best`, `last`, or the number of a step."""
-    if text not in ("best", "last") and not text.isdecimal():
+    if text in ("best", "last"):
+        return text
+    if not text.isdecimal():
         raise SettingsError(f"--which: '{text}' is neither best, last nor a step")
-    return text if text in ("best", "last") else int(text)
+    return int(text)
 
 
 def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
@@ -158,22 +156,16 @@ def _measure(
     begun = time.time()
     policy, cfg = _policy(options, changes)
     has_objects = suite in suites.SUITES and suites.SUITES[suite].objects
-    several = options.out is not None
-    prepared = suites.prepare(
-        cfg,
-        suite,
-        episodes,
-        options.seed,
-        options.physics,
-        options.robot,
-        options.objects if has_objects or not several else None,
-        options.split,
-        learned=options.policy == "learned",
-    )
+    objects = options.objects if has_objects or options.out is None else None
+    world = (options.seed, options.physics, options.robot, objects, options.split)
+    prepared = suites.prepare(cfg, suite, episodes, *world, options.policy == "learned")
     table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
+    asked = {"policy": options.policy, "which": options.which, "seed": options.seed}
     library = {"objects": prepared.cfg.scene.objects, "split": options.split}
     return {
-        **_asked(options, suite, episodes),
+        **asked,
+        "suite": suite,
+        "episodes": episodes,
         **(library if prepared.cfg.scene.has_objects else {}),
         "seconds": round(time.time() - begun, 1),
         **table,
@@ -182,26 +174,20 @@ def _measure(
     }
 
 
-def _asked(options: EvalOptions, suite: str, episodes: int) -> dict[str, Any]:
-    names = ("policy", "which", "seed")
-    return {**{n: getattr(options, n) for n in names}, "suite": suite, "episodes": episodes}
-
-
-def _measure_all(options: EvalOptions, changes: dict[str, Any]) -> int:
+def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> int:
     """Measures what the folder lacks, suite by suite; returns the exit code."""
     from csac_jax.evaluation import suites
 
-    assert options.out is not None
-    if options.out.exists() and not options.out.is_dir():
-        raise SettingsError(f"--out: {options.out} is a file; give a folder")
-    options.out.mkdir(parents=True, exist_ok=True)  # before hours of work
+    if out.exists() and not out.is_dir():
+        raise SettingsError(f"--out: {out} is a file; give a folder")
+    out.mkdir(parents=True, exist_ok=True)  # before hours of work
     policy, cfg = _policy(options, changes)
     chosen = _fitting(options, cfg) if "all" in options.suites else options.suites
     for suite in chosen:
         suites.check(suite)
-    tag = _digest(options, policy, changes)
+    tag = _digest(options, policy, cfg)
     numbers = {suite: options.episodes or _episodes(options, suite) for suite in chosen}
-    paths = {suite: options.out / f"{Path(suite).stem}.json" for suite in chosen}
+    paths = {suite: out / f"{Path(suite).stem}.json" for suite in chosen}
     waiting = [suite for suite in chosen if not _is_kept(paths[suite], numbers[suite], tag)]
     for suite in sorted(set(chosen) - set(waiting)):
         print(f"{suite}, kept from before", flush=True)
@@ -209,14 +195,14 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any]) -> int:
     def on_done(number: int, result: dict[str, Any]) -> None:
         suite = waiting[number]
         files.write_json(paths[suite], {**result, "digest": tag})
-        _write_table(options.out, paths)
+        _write_table(out, paths)
         print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
 
     tasks = [(options, changes, suite, numbers[suite]) for suite in waiting]
     with output.progress() as bars:
         jobs = options.jobs or processes.cores()
         processes.each(_measure, tasks, jobs, _shown(bars), on_done)
-    print(_write_table(options.out, paths), end="")
+    print(_write_table(out, paths), end="")
     return 0
 
 
@@ -224,13 +210,12 @@ def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
     """Returns the suites that a policy of this config can act in."""
     from csac_jax.evaluation import suites
 
-    can_clear = options.policy != "learned" or cfg.task.kind == "clear"
-    can_target = options.policy != "learned" or cfg.task.kind == "target"
+    targets = {cfg.task.kind == "target"} if options.policy == "learned" else {False, True}
     has_library = bool(options.objects or cfg.scene.objects)
     return tuple(
         name
         for name, suite in suites.SUITES.items()
-        if (can_target if suite.target else can_clear) and (has_library or not suite.objects)
+        if suite.target in targets and (has_library or not suite.objects)
     )
 
 
@@ -241,7 +226,7 @@ def _episodes(options: EvalOptions, suite: str) -> int:
     return max(1, round(options.share * full))
 
 
-def _digest(options: EvalOptions, policy: Any, changes: dict[str, Any]) -> str:
+def _digest(options: EvalOptions, policy: Any, cfg: Any) -> str:
     """Returns a digest of all that a result follows from: networks, settings and options."""
     import jax
     import numpy as np
@@ -249,8 +234,8 @@ def _digest(options: EvalOptions, policy: Any, changes: dict[str, Any]) -> str:
     from csac_jax.io import configs
 
     given = dataclasses.replace(options, out=None, jobs=0, suites=(), share=1.0, episodes=None)
-    settings = configs.to_dict(policy.cfg.change(**changes))
-    digest = hashlib.sha256(json.dumps([str(given), settings], sort_keys=True).encode())
+    content = json.dumps([str(given), configs.to_dict(cfg)], sort_keys=True)
+    digest = hashlib.sha256(content.encode())
     for leaf in jax.tree.leaves(getattr(policy, "params", ())):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()
@@ -265,11 +250,10 @@ def _is_kept(path: Path, episodes: int, tag: str) -> bool:
     return (result.get("episodes"), result.get("digest")) == (episodes, tag)
 
 
-def _write_table(folder: Path | None, paths: dict[str, Path]) -> str:
+def _write_table(folder: Path, paths: dict[str, Path]) -> str:
     """Writes and returns the table of the suites that are measured."""
     from csac_jax.report import suite_table
 
-    assert folder is not None
     results = [files.read_object(path) for path in paths.values() if path.exists()]
     text = suite_table.markdown(suite_table.rows(results))
     files.replace(folder / TABLE, text)
@@ -278,19 +262,12 @@ def _write_table(folder: Path | None, paths: dict[str, Path]) -> str:
 
 def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
     """Returns a function that shows a suite's progress on a terminal."""
-    lines: dict[str, Any] = {}
+    lines: dict[str, Any] = collections.defaultdict(lambda: bars.add_task(""))
 
-    def show(suite: str, part: str, finished: int, episodes: int) -> None:
-        if suite not in lines:
-            lines[suite] = bars.add_task("")
-        title = part if part == suite else f"{suite}, {part}"
-        bars.update(
-            lines[suite],
-            description=f"{title}, episodes",
-            completed=finished,
-            total=episodes,
-            visible=finished < episodes,
-        )
+    def show(suite: str, part: str, finished: int, total: int) -> None:
+        title = f"{part if part == suite else f'{suite}, {part}'}, episodes"
+        numbers = {"completed": finished, "total": total, "visible": finished < total}
+        bars.update(lines[suite], description=title, **numbers)
 
     return show
 

@@ -37,14 +37,11 @@ def check_physics(cfg: Config, devices: int = 1) -> None:
     """Raises SettingsError for an unknown gripper, or physics that these devices cannot run."""
     grippers.load(cfg.sim.gripper)
     if cfg.sim.physics == "c" and devices > 1:
-        raise SettingsError(
-            "--sim.physics: c computes on the host's cores, for one device; "
-            "leave out --devices or take mjx"
-        )
+        text = "c computes on the host's cores, for one device; leave out --devices or take mjx"
+        raise SettingsError(f"--sim.physics: {text}")
     if cfg.sim.physics == "warp":
         import jax
 
         if jax.default_backend() != "gpu":
-            raise SettingsError(
-                "--sim.physics: warp computes on CUDA, and JAX sees none here; leave it at mjx"
-            )
+            text = "warp computes on CUDA, and JAX sees none here; leave it at mjx"
+            raise SettingsError(f"--sim.physics: {text}")

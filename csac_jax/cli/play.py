@@ -61,9 +61,8 @@ def run(arguments: list[str]) -> int:
 
     print(episode.summary(env, steps))
     if drawn or options.viewer:
-        stage = episode.EpisodeRenderer(
-            env.cfg, steps[0].before, options.size, opengl, options.views
-        )
+        first = steps[0].before
+        stage = episode.EpisodeRenderer(env.cfg, first, options.size, opengl, options.views)
         episode.record(stage, steps, options.png, options.video)
     taken, lost = episode.totals(steps)
     result = {
@@ -118,17 +117,9 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     from csac_jax.runtime import cache
 
     cache.enable()
-    suite = _suite(options.scene)
-    prepared = suites.prepare(
-        policy.cfg.change(**view),
-        suite,
-        1,
-        options.seed,
-        options.physics,
-        options.robot,
-        options.objects,
-        "all",
-    )
+    world = (options.seed, options.physics, options.robot, options.objects)
+    cfg, suite = policy.cfg.change(**view), _suite(options.scene)
+    prepared = suites.prepare(cfg, suite, 1, *world, split="all")
     (env,) = prepared.parts.values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")

@@ -29,14 +29,9 @@ FIRST = {
     "net": ("kind",),
 }
 """The settings that people change first: those of the short help."""
-VIEW: dict[str, tuple[str, ...]] = {
-    "heightmap": (),
-    "camera": (),
-    "sensor": (),
-    "sim": ("gripper", "base", "adapter", "clearance"),
-}
-"""Sections that say how a policy sees and which hand it moves, () or some of their settings; `eval`
-and `play` take them for any policy."""
+_HAND = ("gripper", "base", "adapter", "clearance")
+VIEW: dict[str, tuple[str, ...]] = {"heightmap": (), "camera": (), "sensor": (), "sim": _HAND}
+"""Sections of a policy's view and hand, () or some of their settings, for `eval` and `play`."""
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -117,7 +112,6 @@ def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
 
 
 def _description(options: type, command: str, examples: Sequence[str]) -> str:
-    """Returns the head of the short help: presets, algorithms and examples."""
     lines = [
         *(inspect.getdoc(options) or "", "", f"presets: {PRESETS}", ""),
         *(f"algorithms: {', '.join(algorithms.ALGORITHMS)}", "", "examples:"),
@@ -156,26 +150,21 @@ def parse_view(
 
     Returns the latter as `Config.change` takes them: a setting without a flag stays the policy's.
     """
-    sections = {name: type(getattr(Config, name)) for name in VIEW}
-    hint = "(default: the policy's)"
-    kinds = {
-        name: _some(kind, VIEW[name] or config.names(kind), hint) for name, kind in sections.items()
-    }
+    kinds = {}
+    for name, some in VIEW.items():
+        kind = type(getattr(Config, name))
+        kinds[name] = _some(kind, some or config.names(kind), "(default: the policy's)")
     given = parsing.parse(_with_sections(options, kinds), flags, command)
     named = {flag.split("=")[0].replace("-", "_") for flag in flags}
-    changes = {name: vars(getattr(given, name)).items() for name in VIEW}
     return given, {
-        name: {key: value for key, value in values if f"__{name}.{key}" in named}
-        for name, values in changes.items()
+        name: {k: v for k, v in vars(getattr(given, name)).items() if f"__{name}.{k}" in named}
+        for name in VIEW
     }
 
 
 def decision(options: Any) -> dict[str, Any]:
     """Returns the settings of section `policy` that a command's options give."""
-    mirrored = None if options.augment is None else options.augment == "on"
-    values = {
-        "augment": mirrored,
-        "height_bonus": options.height_bonus,
-        "retry_temperature": options.retry_temperature,
-    }
+    values = {name: getattr(options, name) for name in ("height_bonus", "retry_temperature")}
+    if options.augment is not None:
+        values["augment"] = options.augment == "on"
     return {name: value for name, value in values.items() if value is not None}

@@ -22,7 +22,6 @@ EXAMPLES = (
     "fast --seeds 4 --devices 4 --init shipped",
     "paper_small --vary algo=csac,csac_beta --vary task=clear,packed --evaluate 500",
 )
-STUDY = "study.md"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,14 +109,12 @@ def _write_study(folder: Path) -> None:
     from csac_jax.report import comparison, figures, result_tables, results, study
 
     report = comparison.build(results.read([folder]))
-    table, command = (
-        result_tables.table_text(study.table(report)),
-        f"{PROGRAM} sweep --resume {folder}",
-    )
-    text = f"# Study\n\nWritten by `{command}`.\n\n{result_tables.EXPLAINED}\n\n{table}\n"
-    files.replace(folder / STUDY, text)
-    figures.save(figures.study(study.rows(report)), (folder / STUDY).with_suffix(".png"))
-    print(f"table and figure: {folder / STUDY}, {(folder / STUDY).with_suffix('.png')}")
+    page, picture = folder / "study.md", folder / "study.png"
+    head = f"# Study\n\nWritten by `{PROGRAM} sweep --resume {folder}`.\n\n"
+    table = result_tables.table_text(study.table(report))
+    files.replace(page, f"{head}{result_tables.EXPLAINED}\n\n{table}\n")
+    figures.save(figures.study(study.rows(report)), picture)
+    print(f"table and figure: {page}, {picture}")
 
 
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:
@@ -150,9 +147,7 @@ def _join(options: SweepOptions) -> None:
     if not options.cluster and place == (None, None, None):
         return
     if options.run_dir is None and options.resume is None:
-        raise SettingsError(
-            "sweep: several processes need --run-dir, a folder that all of them share"
-        )
+        raise SettingsError("sweep: several processes need --run-dir, a folder that all share")
     from csac_jax.runtime import cluster
 
     cluster.join(*place)

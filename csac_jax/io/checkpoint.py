@@ -6,9 +6,9 @@
     RUN/checkpoints/STEP/manifest.sha256  digest of every file above
     RUN/checkpoints/set-aside/STEP        a step that was skipped on resuming, or saved again
 
-A step is written under another name and renamed once its manifest is there: it appears complete or
-not at all. Orbax restores flipped bits and casts other dtypes silently. So every file is checked
-against the manifest, and every leaf against the shape and dtype that the program expects.
+A step is renamed once its manifest is written: it appears complete or not at all. Orbax restores
+flipped bits and casts other dtypes silently. So every file is checked against the manifest, and
+every leaf against the shape and dtype that the program expects.
 """
 
 import collections
@@ -35,7 +35,7 @@ import tensorstore
 
 from csac_jax.config import Config
 from csac_jax.errors import DataWarning, FailedError
-from csac_jax.io import configs, files, leaves, renames
+from csac_jax.io import configs, files, leaves
 from csac_jax.runtime import cluster, provenance
 
 FOLDER = "checkpoints"
@@ -54,8 +54,7 @@ class CheckpointError(FailedError):
 def check_path(run_dir: Path) -> None:
     """Raises CheckpointError where Orbax would read or write other folders than the run's."""
     path = str(_root(run_dir))
-    bad = [sign for sign in path if sign in _PATTERNS or "\ud800" <= sign <= "\udfff"]
-    if bad:
+    if bad := [sign for sign in path if sign in _PATTERNS or "\ud800" <= sign <= "\udfff"]:
         raise CheckpointError(
             f"{run_dir!a}: no checkpoint can be saved in a path with {bad[0]!a}; name another one"
         )
@@ -71,8 +70,8 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
     root = _root(run_dir)
     draft, folder = root / _DRAFT, root / str(step)
     arrays = {name: _untyped(leaf) for name, leaf in leaves.named(state).items()}
-    if _own_step(arrays) not in (None, step):
-        raise ValueError(f"a state of step {_own_step(arrays)} cannot be saved as step {step}")
+    if (saved := _own_step(arrays)) not in (None, step):
+        raise ValueError(f"a state of step {saved} cannot be saved as step {step}")
     try:
         if cluster.is_first():
             _clean(root)
@@ -142,21 +141,19 @@ def restore(
     """
     folder = sound(run_dir, step)
     record = _read(folder, extra=ocp.args.JsonRestore())["extra"]
-    wanted, layout = leaves.named(abstract_state), leaves.layout(abstract_state)
-    old = {name: _old_name(name, record["layout"]) for name in wanted}
-    different = leaves.difference(record["layout"], {old[name]: layout[name] for name in wanted})
-    if different is not None:
+    if different := leaves.difference(record["layout"], leaves.layout(abstract_state)):
         name, has, needs = different
         raise CheckpointError(
             f"checkpoint {folder} holds {name} as {has}, the program needs {needs}; "
             "use the version of csac_jax that saved it"
         )
     provenance.warn_if_other(record.get("versions"), f"checkpoint {folder}")
-    arrays = {old[name]: _abstract_array(leaf) for name, leaf in wanted.items()}
+    wanted = leaves.named(abstract_state)
+    arrays = {name: _abstract_array(leaf) for name, leaf in wanted.items()}
     arrays = _read(folder, state=ocp.args.StandardRestore(arrays))["state"]
     if (saved := _own_step(arrays)) not in (None, int(folder.name)):
         raise CheckpointError(f"checkpoint {folder} holds step {saved}; remove that folder")
-    state = [_typed(arrays[old[name]], leaf) for name, leaf in wanted.items()]
+    state = [_typed(arrays[name], leaf) for name, leaf in wanted.items()]
     return jax.tree.unflatten(jax.tree.structure(abstract_state), state), record["extra"]
 
 
@@ -191,8 +188,9 @@ def set_aside(run_dir: Path, step: int | None = None) -> None:
 
 def set_aside_after(run_dir: Path, step: int) -> None:
     """Moves steps newer than `step`, sound or not, to another folder."""
-    for number in [number for number in _steps(run_dir) if number > step]:
-        _set_aside(_root(run_dir) / str(number))
+    for number in _steps(run_dir):
+        if number > step:
+            _set_aside(_root(run_dir) / str(number))
 
 
 def load_extra(run_dir: Path) -> dict[str, Any]:
@@ -223,10 +221,7 @@ def _publish(draft: Path, folder: Path) -> None:
 
 
 def _clean(root: Path, times: int = 1) -> None:
-    """Removes the drafts of an incomplete save, `times` times in half a second.
-
-    Orbax's threads may still write, and a full disc may refuse to open a folder.
-    """
+    """Removes drafts, `times` times: Orbax's threads may still write, a full disc may refuse."""
     for number in range(times):
         if number:
             time.sleep(0.05)
@@ -237,8 +232,8 @@ def _clean(root: Path, times: int = 1) -> None:
 def _name_run(root: Path) -> str:
     """Returns the name of the run that saves here; draws one if there is none."""
     if cluster.is_first() and _run_name(root) is None:
-        sound = (root / str(step) for step in _steps(root.parent)[::-1])
-        saved = next((_record(folder) for folder in sound if _fault(folder) is None), {})
+        folders = (root / str(step) for step in _steps(root.parent)[::-1])
+        saved = next((_record(folder) for folder in folders if _fault(folder) is None), {})
         name = str(saved.get("run") or secrets.token_hex(8))
         files.replace(root / _RUN, f"{name} {hashlib.sha256(name.encode()).hexdigest()}")
     cluster.wait(f"named {root}")
@@ -246,7 +241,7 @@ def _name_run(root: Path) -> str:
 
 
 def _run_name(root: Path) -> str | None:
-    """Returns the name of the run of these checkpoints, None if it is missing or damaged."""
+    """Returns the run's name, None if it is missing or damaged."""
     if not (root / _RUN).is_file():
         return None
     name, _, digest = (root / _RUN).read_bytes().partition(b" ")
@@ -298,20 +293,11 @@ def _steps(run_dir: Path) -> list[int]:
     return sorted(int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,17}", name))
 
 
-def _old_name(name: str, layout: dict[str, str]) -> str:
-    """Returns the name of a leaf in a checkpoint of this layout, which may be older."""
-    older = {new: old for old, new in renames.STATE.items()}
-    return name if name in layout else older.get(name, name)
-
-
-# Orbax gets a flat dict of plain arrays; typed keys are stored as their bits.
-
-
 def _is_key(leaf: Any) -> bool:
     return jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
-def _untyped(leaf: Any) -> Any:
+def _untyped(leaf: Any) -> Any:  # Orbax stores a typed key as its bits
     return jax.random.key_data(leaf) if _is_key(leaf) else leaf
 
 
@@ -322,7 +308,6 @@ def _abstract_array(leaf: Any) -> jax.ShapeDtypeStruct:
 
 
 def _typed(array: Any, leaf: Any) -> Any:
-    """Returns an array as it was saved, a typed key if the abstract leaf is one."""
     if not _is_key(leaf):
         return array
     impl = jax.random.key_impl(jax.lax.full((), 0, leaf.dtype))
@@ -338,20 +323,19 @@ def _record(folder: Path) -> dict[str, Any]:
 
 
 def _own_step(arrays: dict[str, Any]) -> int | None:
-    """Returns the step counter in a state, None without one."""
     step = arrays.get("step")
     return int(step) if step is not None and step.shape == () else None
 
 
 def _digests(folder: Path) -> dict[str, str]:
     """Returns the SHA-256 of each file of a step but the manifest."""
-    digests = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and path.name != MANIFEST:
-            with path.open("rb") as file:
-                digest = hashlib.file_digest(file, "sha256").hexdigest()
-            digests[path.relative_to(folder).as_posix()] = digest
-    return digests
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != MANIFEST]
+    return {path.relative_to(folder).as_posix(): _sha256(path) for path in paths}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _fault(folder: Path) -> str | None:

@@ -7,7 +7,7 @@
     tau = 0.01
 
 Such a file changes settings of its preset. One with a `format`, as runs write it, holds all; a
-setting that it lacks takes its default. Values are read as data: nothing in a file is executed.
+setting that it lacks takes its default. Nothing in a file is executed.
 """
 
 import dataclasses
@@ -30,37 +30,30 @@ FORMAT = 2
 
 def to_dict(cfg: Config) -> dict[str, Any]:
     """Returns a config as plain JSON values, with the number of its format."""
-    sections = {
-        name: _section_dict(value) if isinstance(value, Section) else value
-        for name, value in vars(cfg).items()
-    }
-    return {"format": FORMAT, **json.loads(json.dumps(sections))}
+    return {"format": FORMAT, **json.loads(json.dumps(vars(cfg), default=_plain))}
 
 
-def _section_dict(section: Section) -> dict[str, Any]:
-    values = dict(vars(section))
-    if isinstance(own := values.get("gripper"), Gripper):
-        values["gripper"] = {"folder": str(own.folder), **grippers.to_numbers(own)}
-    return values
+def _plain(value: Section | Gripper) -> dict[str, Any]:
+    if isinstance(value, Gripper):
+        return {"folder": str(value.folder), **grippers.to_numbers(value)}
+    return vars(value)
 
 
 def from_dict(values: Any) -> Config:
-    """Reads what `to_dict` returned, of older versions too. Raises SettingsError in one line for an
-    unknown setting, a wrong type or a value out of range."""
+    """Reads what `to_dict` returned, of older versions too. Raises SettingsError in one line."""
     if not isinstance(values, dict):
         raise SettingsError(f"config: must be an object, not {shown(values)}")
     if (number := values.get("format")) != FORMAT:
-        told = f"{shown(number)} is unknown, this version reads {FORMAT}"
-        raise SettingsError(f"format: {told}; use the csac-jax that wrote it")
-    stored = renames.current({name: one for name, one in values.items() if name != "format"})
-    return Config(**{name: _validated(name, value) for name, value in stored.items()})
+        text = f"{shown(number)} is unknown, this version reads {FORMAT}"
+        raise SettingsError(f"format: {text}; use the csac-jax that wrote it")
+    stored = renames.current(values)
+    return Config(**{name: _validated(name, stored[name]) for name in stored if name != "format"})
 
 
 def differences(a: Config, b: Config) -> list[str]:
     """Returns the dotted names of the settings that differ, in order of their definition."""
     flat_a, flat_b = flat(to_dict(a)), flat(to_dict(b))
-    both = dict.fromkeys([*flat_a, *flat_b])
-    return [name for name in both if flat_a.get(name) != flat_b.get(name)]
+    return [name for name in flat_a | flat_b if flat_a.get(name) != flat_b.get(name)]
 
 
 def flat(values: dict[str, Any]) -> dict[str, Any]:
@@ -120,10 +113,9 @@ def _adapter(kind: Any) -> Any:
 
 
 def load_config(path: str | Path, preset: str | None = None, algo: str | None = None) -> Config:
-    """Reads the config of a file; settings of the file win over what `algo` brings.
+    """Reads the config of a file; its settings win over what `algo` brings, `algo` over its own.
 
-    Args: preset, given elsewhere, which the file's must not contradict; algo, which wins over the
-    file's. Raises SettingsError, one line that names the file and the key.
+    `preset` must not contradict the file's. Raises SettingsError, one line with file and key.
     """
     try:
         return _configured(_read(Path(path)), preset, algo)
@@ -160,13 +152,12 @@ def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
             raise SettingsError(f"{name}: must be a section of settings, not {shown(value)}")
         tag, _ = config.ALTERNATIVES.get(name, ("", ()))
         if tag in value:
-            section = config.alternative(section, value[tag])
-        whole[name] = _section_dict(section) | value
+            whole[name] = vars(config.alternative(section, value[tag]))
+        whole[name] = whole[name] | value
     return whole
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Reads the content of a file as JSON values."""
     if path.suffix not in READERS:
         raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
     kind, parse = READERS[path.suffix]

@@ -35,9 +35,7 @@ def exclusive(folder: Path) -> Iterator[None]:
         raise LockedError(f"{folder} is in use by {user}; wait until it ends, or stop it") from None
     host = socket.gethostname()
     if (last := _name_of(holder)) and not last.endswith(f" on {host}"):
-        text = (
-            f"{folder} was in use by {last} and not released; check that it does not run any more"
-        )
+        text = f"{folder} was in use by {last} and not released; check that it does not run"
         warnings.warn(text, DataWarning, stacklevel=3)
     try:
         files.replace(holder, f"process {os.getpid()} on {host}")

@@ -1,8 +1,7 @@
 """A policy in a .safetensors file: its networks' variables and the config they were trained with.
 
 Nothing in such a file is executed. It holds a digest of its content, and the versions of the
-libraries that made it. Files of `SHIPPED` come with the package, see docs/policies.md. Their
-digests are here, which detects a replaced file.
+libraries that made it. Files of `SHIPPED` come with the package, see docs/policies.md.
 """
 
 import hashlib
@@ -25,22 +24,16 @@ from csac_jax.io import configs, files, leaves
 from csac_jax.runtime import provenance
 
 _FOLDER = Path(__file__).parents[1] / "policies"
-SHIPPED = {
-    "shipped": _FOLDER / "clear.safetensors",
-    "shipped_camera": _FOLDER / "camera.safetensors",
-    "shipped_clutter": _FOLDER / "clutter.safetensors",
-    "shipped_grippers": _FOLDER / "grippers.safetensors",
-    "shipped_objects": _FOLDER / "objects.safetensors",
-    "shipped_target": _FOLDER / "target.safetensors",
+_DIGESTS = {  # so that a replaced file is detected
+    "clear": "28e4450df466158ece399eace4a792748c65f3d430210f145b6621c4d5344cd2",
+    "camera": "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
+    "clutter": "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
+    "grippers": "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
+    "objects": "12bf20a8a5597f313de22580922bfa6b0ac89f614ae06d4afe401f81f1ad425e",
+    "target": "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
 }
-_SHA256 = {
-    SHIPPED["shipped"]: "28e4450df466158ece399eace4a792748c65f3d430210f145b6621c4d5344cd2",
-    SHIPPED["shipped_camera"]: "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
-    SHIPPED["shipped_clutter"]: "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
-    SHIPPED["shipped_grippers"]: "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
-    SHIPPED["shipped_objects"]: "12bf20a8a5597f313de22580922bfa6b0ac89f614ae06d4afe401f81f1ad425e",
-    SHIPPED["shipped_target"]: "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
-}
+_SHA256 = {_FOLDER / f"{name}.safetensors": digest for name, digest in _DIGESTS.items()}
+SHIPPED = {f"shipped_{path.stem}".removesuffix("_clear"): path for path in _SHA256}
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
 _GRIPPER = "gripper"  # remark of older files: the numbers of the user's own gripper
 
@@ -50,14 +43,12 @@ class PolicyFileError(FailedError):
 
 
 def save(path: Path, params: Params, cfg: Config) -> None:
-    """Writes a policy; see `files.replace`. Raises OSError where it cannot be written, and
-    PolicyFileError for networks that are not finite."""
+    """Writes a policy. Raises OSError, and PolicyFileError for networks that are not finite."""
     tensors = {name: np.asarray(leaf) for name, leaf in leaves.named(params).items()}
     check_finite(path, tensors)
-    versions = json.dumps(provenance.versions())
     gripper = grippers.resolve(cfg.sim.gripper)  # its folder is not where the policy goes
     stored = configs.to_dict(cfg.change(sim={"gripper": gripper}))
-    remarks = {_CONFIG: json.dumps(stored), _VERSIONS: versions}
+    remarks = {_CONFIG: json.dumps(stored), _VERSIONS: json.dumps(provenance.versions())}
     remarks[_DIGEST] = _digest(remarks, tensors)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
 
@@ -70,7 +61,7 @@ def check_finite(source: Any, params: Any) -> None:
 
 
 def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
-    """Returns the SHA-256 of a policy's content but the digest itself."""
+    """Returns the SHA-256 of a policy without its digest."""
     content = hashlib.sha256()
     for name in sorted(remarks.keys() - {_DIGEST}):
         content.update(f"{name}={remarks[name]}\n".encode())
@@ -84,10 +75,8 @@ def find(source: str | Path) -> Path:
     """Returns the policy file or run folder that `source` names. Raises FileNotFoundError."""
     path = SHIPPED.get(str(source), Path(source))
     if not path.exists():
-        known = ", ".join(SHIPPED)
-        raise FileNotFoundError(
-            f"there is no folder {path}; give the folder of a run, a policy file, or one of {known}"
-        )
+        known = f"give the folder of a run, a policy file, or one of {', '.join(SHIPPED)}"
+        raise FileNotFoundError(f"there is no folder {path}; {known}")
     return path
 
 

@@ -44,24 +44,20 @@ METRICS = {
 }
 """Keys of metrics.jsonl and of results of `eval --json`, and the suite of that name."""
 
-STATE: dict[str, str] = {}
-"""Leaves of a checkpoint."""
-
 
 def current(values: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the values of a stored config under the names of today."""
-    new = {name: dict(one) if isinstance(one, dict) else one for name, one in values.items()}
-    for old, name in SETTINGS.items():
-        section, _, field = old.partition(".")
-        if isinstance(new.get(section), dict) and field in new[section]:
-            value = new[section].pop(field)
-            if name is not None:
-                section, _, field = name.partition(".")
-                new.setdefault(section, {})[field] = value
-    for name, texts in VALUES.items():
-        section, _, field = name.partition(".")
-        if isinstance(new.get(section), dict) and field in new[section]:
-            new[section][field] = _current_value(texts, new[section][field])
+    new: dict[str, Any] = {}
+    for section, fields in values.items():
+        if not isinstance(fields, dict):
+            new[section] = fields
+            continue
+        new.setdefault(section, {})
+        for field, value in fields.items():
+            dotted = f"{section}.{field}"
+            if (name := SETTINGS.get(dotted, dotted)) is not None:
+                target, key = (section, field) if name == dotted else name.split(".")
+                new.setdefault(target, {})[key] = _current_value(VALUES.get(name, {}), value)
     return new
 
 

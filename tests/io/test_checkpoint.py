@@ -334,15 +334,3 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
         checkpoint.load_config(tmp_path)
-
-
-def test_old_names_of_leaves_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: leaves with the old names of `renames.STATE` come back under the names of today, next
-    to leaves that kept their names; those of today are read as they are."""
-    monkeypatch.setattr(checkpoint.renames, "STATE", {"a.old": "a.new"})
-    old = {"a": {"old": jax.random.key(5), "b": jnp.arange(3.0)}, "step": jnp.int32(4)}
-    new = {"a": {"new": old["a"]["old"], "b": old["a"]["b"]}, "step": jnp.int32(4)}
-    for stored in (old, new):
-        checkpoint.save(tmp_path, 4, stored, CFG, {})
-        state, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: new))
-        assert jax.tree.map(_bits, state) == jax.tree.map(_bits, new)
