@@ -137,7 +137,7 @@ class ResultReport(NamedTuple):
 
 
 def build(results: Results, reference: str | None = None) -> ResultReport:
-    """Groups runs and evaluations over seeds. Raises SettingsError for a reference without results."""
+    """Groups runs and evaluations by seeds. Raises SettingsError for an unknown reference."""
     curves = [Curve(*group) for group in grouped(results.runs, lambda run: run.variant).items()]
     scores = [
         Score._make((*key, grouped(group, lambda one: one.part)))
