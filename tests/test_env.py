@@ -317,7 +317,7 @@ def _spoil(state: State, action: Action, where: str, value: float, sick: int) ->
     def written(tree, leaf: str):
         old = np.array(getattr(tree, leaf))
         with np.errstate(invalid="ignore"):
-            old[sick].flat[-1] = np.asarray(value).astype(old.dtype)
+            old[sick : sick + 1].flat[-1] = np.asarray(value).astype(old.dtype)
         return dataclasses.replace(tree, **{leaf: jnp.asarray(old)})
 
     part, leaf = where.split(".")
