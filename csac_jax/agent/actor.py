@@ -1,7 +1,4 @@
-"""The actor: a pose per primitive by a soft-argmax around its highest logit, and its update.
-
-A soft-argmax over the whole map would lie between two peaks.
-"""
+"""The actor: a pose per primitive by a soft-argmax around its highest logit, and its update."""
 
 import functools
 from typing import Any
@@ -18,7 +15,7 @@ from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
 
-_WINDOW = np.arange(-2, 3)  # cells around the highest one that the soft-argmax covers
+_WINDOW = np.arange(-2, 3)  # cells around the highest; of the whole map it lies between two peaks
 _INWARD = 2 + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towards the middle
 
 
@@ -49,8 +46,7 @@ def _along_yaw(
 ) -> jax.Array:
     """Interpolates logits [3] at a place [2] m and three yaws [3]; -inf where it is not valid.
 
-    Only valid cells are mixed: sum w_i l_i / sum w_i, where w_i is the bilinear weight of a valid
-    cell and 0 for any other. If none of the three is valid, the middle one counts.
+    Only valid cells are mixed: sum w_i l_i / sum w_i. If none is valid, the middle yaw counts.
     """
     valid = state.valid[primitive]
     valid |= ~jnp.any(valid)

@@ -1,7 +1,4 @@
-"""Networks and optimisers of an actor-critic: static parts, initial state and parameters.
-
-M = critics, one or two of the same shape, with stacked parameters.
-"""
+"""Networks and optimisers of an actor-critic: static parts, initial state and parameters."""
 
 import dataclasses
 from typing import Any
@@ -12,7 +9,6 @@ import optax
 from flax import struct
 
 from csac_jax.agent import maps, rewards
-from csac_jax.agent.maps import Frames
 from csac_jax.config import Config
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
@@ -22,7 +18,7 @@ from csac_jax.vision.heightmap import Observation
 class Params:
     """Variables of the networks theta^Q and theta^mu, with running statistics of batch norm."""
 
-    critic: Any  # leaves [M, ...]
+    critic: Any  # leaves [M, ...], M critics, one or two
     actor: Any
 
 
@@ -42,7 +38,7 @@ class ActorCritic:
     """Static part: closed over by the compiled step."""
 
     cfg: Config
-    frames: Frames
+    frames: maps.Frames
     critic_optimiser: optax.GradientTransformation
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
@@ -59,7 +55,7 @@ def make(cfg: Config, network: Any = None) -> ActorCritic:
     return with_optimisers(cfg, frames, rewards.bounds(cfg.reward, cfg.target.gamma))
 
 
-def with_optimisers(cfg: Config, frames: Frames, bounds: tuple[Any, Any]) -> ActorCritic:
+def with_optimisers(cfg: Config, frames: maps.Frames, bounds: tuple[Any, Any]) -> ActorCritic:
     """Adds Adam with clipped gradients and a linear learning rate; numbers may be traced."""
 
     def adam(rate: float, updates: int) -> optax.GradientTransformation:
@@ -104,8 +100,7 @@ def with_params(state: LearnerState, params: Params) -> LearnerState:
 def with_inputs(params: Params, wanted: Params) -> Params:
     """Adds the last inputs that `wanted` has and `params` lack, with weights of 0.
 
-    The outputs stay the same until the networks learn. Networks that differ in another way are
-    returned unchanged.
+    The outputs stay the same. Networks that differ in another way are returned unchanged.
     """
     structure: Any = jax.tree.structure(params)
     if structure != jax.tree.structure(wanted):

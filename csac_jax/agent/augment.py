@@ -13,7 +13,6 @@ from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import heightmap
-from csac_jax.vision.heightmap import PackedObservation
 
 
 def apply_symmetry(
@@ -78,7 +77,7 @@ def _stays(cfg: Config, height: jax.Array, step: jax.Array) -> jax.Array:
     return jnp.all((height <= BARE) | stays)
 
 
-def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
+def _shift_maps(obs: heightmap.PackedObservation, cells: jax.Array) -> heightmap.PackedObservation:
     """Shifts maps by `cells` [2] int32; cells that come in look like the lowest one."""
     size = obs.height.shape[0]
     row, col = (jnp.arange(size, dtype=jnp.int32) - count for count in cells)
@@ -91,7 +90,7 @@ def _shift_maps(obs: PackedObservation, cells: jax.Array) -> PackedObservation:
     )
     height = jnp.where(inside, height, jnp.uint16(0))
     target = jnp.where(inside, target, jnp.all(obs.target))
-    return PackedObservation(colour, height, target, obs.fingers)
+    return heightmap.PackedObservation(colour, height, target, obs.fingers)
 
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:

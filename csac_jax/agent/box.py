@@ -7,14 +7,19 @@ import numpy as np
 POSE_WRAPS = np.array([False, False, True])  # of (x, y, yaw)
 
 
-def wrap_yaw(u: jax.Array) -> jax.Array:
-    """Wraps the yaw of poses, or of offsets between them, [..., 3] to [-1, 1).
+def wrap(u: jax.Array) -> jax.Array:
+    """Wraps a circle of circumference 2 to [-1, 1), any shape.
 
     Near the seam u + 1 is exact in float32: the remainder cannot round up to a whole turn.
     """
-    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), jnp.mod(u + 1.0, 2.0) - 1.0, u)
+    return jnp.mod(u + 1.0, 2.0) - 1.0
+
+
+def wrap_yaw(u: jax.Array) -> jax.Array:
+    """Wraps the yaw of poses, or of offsets between them, [..., 3]."""
+    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), u)
 
 
 def project(u: jax.Array) -> jax.Array:
     """Projects points `u` [..., 3] to the box: yaw wraps, x and y are clipped."""
-    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap_yaw(u), jnp.clip(u, -1.0, 1.0))
+    return jnp.where(jnp.broadcast_to(POSE_WRAPS, u.shape), wrap(u), jnp.clip(u, -1.0, 1.0))

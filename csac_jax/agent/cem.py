@@ -64,12 +64,12 @@ def _update(cfg: CEMConfig, score: Score, search: _Search, actions: jax.Array) -
     """Updates the search with `actions` [J, 3]; unchanged if none of them has a value."""
     values = jax.vmap(score)(actions)  # [J]
     elite_values, elite = jax.lax.top_k(jnp.where(jnp.isnan(values), -jnp.inf, values), cfg.elites)
-    elites, valid = actions[elite], elite_values > -jnp.inf  # [K, 3] and [K], best first
-    mean, std = fit(cfg, elites, valid)
-    better = elite_values[0] > search.best.value
+    elites = actions[elite]  # [K, 3], best first
+    mean, std = fit(cfg, elites, elite_values > -jnp.inf)
+    any_valid, better = elite_values[0] > -jnp.inf, elite_values[0] > search.best.value
     action = jnp.where(better, elites[0], search.best.action)
     value = jnp.where(better, elite_values[0], search.best.value)
-    mean, std = jnp.where(valid[0], mean, search.mean), jnp.where(valid[0], std, search.std)
+    mean, std = jnp.where(any_valid, mean, search.mean), jnp.where(any_valid, std, search.std)
     return _Search(mean, std, CEMResult(action, value, actions))
 
 

@@ -10,15 +10,13 @@ import optax
 from csac_jax.agent import actor, losses, maps, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState, Params
 from csac_jax.agent.learner import Transition, UpdateInfo
-from csac_jax.agent.maps import DenseMaps
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
 from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap, rotate
-from csac_jax.vision.heightmap import Observation
 
 
-def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
+def next_value(learner: ActorCritic, key: jax.Array, state: maps.DenseMaps) -> jax.Array:
     """Computes V(s') [] over the primitives that the policy takes, by `target.value`.
 
     The maximum (eq. 9, VPG) is over valid cells; over all if none is valid.
@@ -30,14 +28,16 @@ def next_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Ar
     return jnp.max(jnp.where(valid | ~jnp.any(valid), state.q[chosen], -jnp.inf))
 
 
-def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> jax.Array:
+def _softmax_value(learner: ActorCritic, key: jax.Array, state: maps.DenseMaps) -> jax.Array:
     """Estimates softmax_beta(Q'(s', .)) [] from noisy target actions, Algorithm 1 line 17.
 
     Samples on empty table are ignored unless all are. beta is relative to `return_range` (ours).
     """
     cfg, frames = learner.cfg.target, learner.frames
 
-    def sample(primitive: jax.Array, single: DenseMaps) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def sample(
+        primitive: jax.Array, single: maps.DenseMaps
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         mean = maps.normalise(frames, actor.pose(frames, single, 0))
         key_noise = jax.random.fold_in(key, primitive)
         noisy, log_density = losses.noisy_actions(key_noise, cfg, mean)
@@ -56,7 +56,7 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: DenseMaps) -> ja
 
 
 def renewed_reward(
-    learner: ActorCritic, params: Params, batch: Transition, next_maps: DenseMaps
+    learner: ActorCritic, params: Params, batch: Transition, next_maps: maps.DenseMaps
 ) -> jax.Array:
     """Returns rewards [B] with eq. 16's label of pushes by `params`, or as stored without labels.
 
@@ -72,7 +72,7 @@ def renewed_reward(
 
 
 def q_of_actions(
-    learner: ActorCritic, critic: Any, obs: Observation, action: Action
+    learner: ActorCritic, critic: Any, obs: heightmap.Observation, action: Action
 ) -> tuple[jax.Array, Any]:
     """Computes Q(s, a) [M, B] from two passes per state, in the frames next to the action's yaw.
 
@@ -88,8 +88,9 @@ def q_of_actions(
     flat, net = passes.reshape(-1, *passes.shape[2:]), frames.networks.critic
     (q, _), statistics = values.map_critics(lambda own: networks.train(net, own, flat), critic)
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]
+    push_output = (k >= num // 2).astype(jnp.int32)
     is_grasp = (action.primitive == Primitive.GRASP)[:, None]
-    output = jnp.where(is_grasp, dense.OUTPUTS - 1, (k >= num // 2).astype(jnp.int32))
+    output = jnp.where(is_grasp, dense.OUTPUTS - 1, push_output)
 
     def at(q: jax.Array, output: jax.Array, half: jax.Array, xy: jax.Array) -> jax.Array:
         yaw = jnp.asarray(frames.yaws)[half]

@@ -11,25 +11,19 @@ import jax.numpy as jnp
 from csac_jax.agent import actor, actor_critic, critic, policy, rewards, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Learner, Transition, UpdateInfo
-from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import chunked_vmap
-from csac_jax.nets.chunked_vmap import ALONE, Batching
 from csac_jax.robot.primitives import Action
 from csac_jax.vision.heightmap import Observation
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CSAC(Learner):
-    """The learner of the algorithms in `algorithms`, by the config of `parts`.
-
-    The training step also calls `update_actor`, once after all updates of a step. Sweeps ask for
-    `replace_hyperparams` and `batched`.
-    """
+    """The learner of the algorithms in `algorithms`, by the config of `parts`."""
 
     parts: ActorCritic
-    batching: Batching = ALONE
+    batching: chunked_vmap.Batching = chunked_vmap.ALONE
 
     def init(self, key: jax.Array) -> LearnerState:
         return actor_critic.init(key, self.parts)
@@ -56,7 +50,7 @@ class CSAC(Learner):
         state: LearnerState,
         obs: Observation,
         next_obs: Observation,
-        result: ActionResult,
+        result: rewards.ActionResult,
     ) -> tuple[jax.Array, jax.Array]:
         """Computes eqs. 10-16, phi by the target critic."""
         pushed = result.primitive == Primitive.PUSH
@@ -73,7 +67,7 @@ class CSAC(Learner):
         return update(key, state, batch, weights)
 
     def update_actor(self, state: LearnerState, obs: Observation) -> tuple[LearnerState, jax.Array]:
-        """Updates the actor on `obs` [B, ...] (lines 22-23); returns also its loss []."""
+        """Updates the actor on `obs` [B, ...] once a step (lines 22-23); also returns its loss."""
         return self._chunked(actor.update)(state, obs)
 
     def replace_hyperparams(self, cfg: Config, return_bounds: tuple[Any, Any]) -> "CSAC":
@@ -81,7 +75,7 @@ class CSAC(Learner):
         parts = actor_critic.with_optimisers(cfg, self.parts.frames, return_bounds)
         return dataclasses.replace(self, parts=parts)
 
-    def batched(self, batching: Batching) -> "CSAC":
+    def batched(self, batching: chunked_vmap.Batching) -> "CSAC":
         """Returns the learner for runs that are vmapped."""
         parts, frames = self.parts, self.parts.frames
         if batching.side_by_side:

@@ -13,7 +13,7 @@ class Greedy(NamedTuple):
     """Greedy decision of the policy. P = primitives."""
 
     primitive: jax.Array  # [] int32, Primitive
-    poses: jax.Array  # [P, 3] normalised (x, y, yaw), the best pose of each primitive
+    poses: jax.Array  # [P, 3] in the box, the best pose of each primitive
     values: jax.Array  # [P] Q of the poses
 
 
@@ -49,10 +49,7 @@ def choose(
 
 
 def random_cell(key: jax.Array, valid: jax.Array) -> jax.Array:
-    """Draws an index [] int32, uniform over True entries of `valid` [n]; 0 without one.
-
-    A random rank among the valid ones: ties of n noises would favour low indices.
-    """
-    count = jnp.cumsum(valid, dtype=jnp.int32)  # [n]
+    """Draws an index [] int32, uniform over True entries of `valid` [n]; 0 without one."""
+    count = jnp.cumsum(valid, dtype=jnp.int32)  # [n]; ties of n noises would favour low indices
     rank = jax.random.randint(key, (), 0, jnp.maximum(count[-1], 1))
     return jnp.argmax(count > rank).astype(jnp.int32)

@@ -1,7 +1,4 @@
-"""The interface between a training step and what learns from replayed transitions.
-
-A custom learner derives from `Learner`: `init`, `act`, `update` and, at will, `reward`.
-"""
+"""The interface between a training step and what learns from replayed transitions."""
 
 import abc
 from typing import Any, NamedTuple
@@ -10,7 +7,6 @@ import jax
 from flax import struct
 
 from csac_jax.agent import rewards
-from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import RewardConfig
 from csac_jax.robot.primitives import Action
 from csac_jax.vision.heightmap import Observation, PackedObservation
@@ -69,7 +65,7 @@ class Learner(abc.ABC):
         state: Any,
         obs: Observation,
         next_obs: Observation,
-        result: ActionResult,
+        result: rewards.ActionResult,
     ) -> tuple[jax.Array, jax.Array]:
         """Computes rewards [E] float32 and which pushes were good [E] bool; `result` lacks phi.
 

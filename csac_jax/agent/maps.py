@@ -111,7 +111,7 @@ def map_primitives(
 ) -> Any:
     """Calls `call(p, single)` for each primitive p of `chosen`: leaves [len(chosen), ...].
 
-    `single` holds the maps of p alone, as those of primitive 0. All are one trace and one loop.
+    `single` holds the maps of p alone, as those of primitive 0. All share one trace.
     """
     singles = jax.tree.map(lambda leaf: jnp.stack([leaf[p][None] for p in chosen]), state)
     return jax.vmap(call)(jnp.array(chosen, jnp.int32), singles)
@@ -142,9 +142,9 @@ def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
-    Grasp: a surface higher than BARE lies under the cell, in the target task the target's. Push: a
-    surface of any block lies within the push's length ahead. With `policy.action_mask` none: every
-    cell inside the workspace. The robot must reach the cell in each case.
+    Grasp: a surface above BARE under the cell, in the target task the target's. Push: one of any
+    block within the push's length ahead. With `policy.action_mask` none, every cell that the robot
+    reaches.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
@@ -226,7 +226,7 @@ def best_cells(values: jax.Array, valid: jax.Array, num: int) -> jax.Array:
 
 
 def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
-    """Returns the pose [3] (x m, y m, yaw rad) of the cell of flat index [] into [K, h, w]."""
+    """Returns the pose [3] (m, m, rad) of the cell of flat index [] into [K, h, w]."""
     xy = jnp.asarray(frames.xy).reshape(-1, 2)[index]
     return jnp.append(xy, jnp.asarray(frames.yaws)[index // frames.side**2])
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 
 from csac_jax.agent import actor, cem, explore, maps
 from csac_jax.agent.actor_critic import ActorCritic
-from csac_jax.agent.cem import CEMResult
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
@@ -28,17 +27,16 @@ def candidates(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> jax.Ar
     return denormalise(learner.frames, _best_poses(key, learner, state).candidates)
 
 
-def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
-    search = POSE_SEARCHES[learner.cfg.policy.place]
+def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResult:
+    search = _cem if learner.cfg.policy.place == "cem" else _best_cell
     call = lambda p, single: search(jax.random.fold_in(key, p), learner, single)  # noqa: E731
     return maps.map_primitives(call, state, tuple(Primitive))
 
 
-def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
+def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResult:
     """Maximises Q of primitive 0 over the pose by the cross-entropy method, lines 8-13.
 
-    Invalid poses are penalised by the range of returns. As many best cells start as there are
-    elites.
+    Invalid poses cost the range of returns. The best cells, as many as elites, start the search.
     """
     cfg, frames = learner.cfg.cem, learner.frames
 
@@ -46,26 +44,20 @@ def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
         value, valid = maps.read_valid(frames, state, 0, maps.denormalise(frames, u))
         return jnp.where(valid, value, value - learner.return_range)
 
-    mean = maps.normalise(frames, actor.pose(frames, state, 0))
     cells = maps.best_cells(state.q[0], state.valid[0], cfg.elites)
-    points = jax.vmap(maps.cell_point, (None, 0))(frames, cells)
-    return cem.maximise(key, cfg, score, *CEM_STARTS[cfg.start](mean, points))
+    start = jax.vmap(maps.cell_point, (None, 0))(frames, cells)
+    mean = maps.normalise(frames, actor.pose(frames, state, 0))
+    mean = start[0] if cfg.start == "cells" else mean
+    return cem.maximise(key, cfg, score, mean, start[:0] if cfg.start == "actor" else start)
 
 
-def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> CEMResult:
+def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResult:
     """Returns the centre of the valid cell where Q of primitive 0 is largest (VPG)."""
     cell = maps.best_cells(state.q[0], state.valid[0], 1)[0]
     u = maps.cell_point(learner.frames, cell)
-    return CEMResult(u, state.q[0].reshape(-1)[cell], u[None])
+    return cem.CEMResult(u, state.q[0].reshape(-1)[cell], u[None])
 
 
-POSE_SEARCHES = {"cem": _cem, "argmax": _best_cell}
-CEM_STARTS: dict[str, Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]] = {
-    # actor's pose [3] and best cells [K, 3] -> mean [3] and starting points [P0, 3]
-    "both": lambda pose, cells: (pose, cells),
-    "actor": lambda pose, cells: (pose, cells[:0]),
-    "cells": lambda pose, cells: (cells[0], cells),
-}
 PRIMITIVE_RULES: dict[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     # values of the best poses [P] and steps without change [] -> primitive [] int32
     "argmax": lambda values, _: jnp.argmax(values).astype(jnp.int32),
@@ -111,10 +103,7 @@ def best_action(
 def after_failures(
     key: jax.Array, learner: ActorCritic, state: DenseMaps, failed_grasps: jax.Array
 ) -> DenseMaps:
-    """Adds Gumbel noise to Q after `failed_grasps` [] in a row.
-
-    The best cell is then a draw from Boltzmann's law, whose temperature rises with each failure.
-    """
+    """Adds Gumbel noise to Q by `failed_grasps` []: the best cell follows Boltzmann's law."""
     if learner.cfg.policy.retry_temperature == 0.0:
         return state
     temperature = learner.cfg.policy.retry_temperature * failed_grasps.astype(jnp.float32)

@@ -76,10 +76,7 @@ def rewards_of(cfg: RewardConfig, results: ActionResult) -> tuple[jax.Array, jax
 
 
 def bounds(cfg: RewardConfig, gamma: float) -> tuple[float, float]:
-    """Returns the smallest and largest discounted return of an episode of any length.
-
-    The smallest is r_min / (1 - gamma) if r_min < 0, else r_min; the largest likewise.
-    """
+    """Returns the smallest and largest discounted return of an episode of any length."""
     grasp = [scale(cfg, cfg.grasp_level) * level for level in cfg.grasp_levels]
     grasp[Outcome.LIFTED] += cfg.success_bonus
     push = [scale(cfg, cfg.push_level) * effect for effect in cfg.push_levels]

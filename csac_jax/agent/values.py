@@ -1,7 +1,4 @@
-"""Values that networks give to a batch of states: dense maps of Q, and phi, the best grasp's value.
-
-Two critics count as one whose value in each cell is the lower of both.
-"""
+"""Values that networks give to a batch of states: dense maps of Q, and phi, the best grasp's."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +8,6 @@ import jax.numpy as jnp
 
 from csac_jax.agent import maps
 from csac_jax.agent.actor_critic import ActorCritic, Params
-from csac_jax.agent.maps import DenseMaps
 from csac_jax.constants import Primitive
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
@@ -22,7 +18,7 @@ _QUARTERS = 4  # parts of a batch that phi is computed for one after the other (
 
 def dense_maps(
     learner: ActorCritic, params: Params, obs: Observation, mirrored: bool = False
-) -> DenseMaps:
+) -> maps.DenseMaps:
     """Computes dense maps of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w].
 
     With `mirrored` Q is the mean over mirror images and critics.
@@ -36,11 +32,8 @@ def dense_maps(
 
 def decision_maps(
     learner: ActorCritic, params: Params, obs: Observation, explores: bool = False
-) -> DenseMaps:
-    """Computes the maps that a policy acts on: `dense_maps` with `policy.height_bonus`.
-
-    Unless it explores, `policy.augment` counts too.
-    """
+) -> maps.DenseMaps:
+    """Computes `dense_maps` with `policy.height_bonus`, and `policy.augment` unless it explores."""
     cfg = learner.cfg.policy
     state = dense_maps(learner, params, obs, cfg.augment and not explores)
     if cfg.height_bonus == 0.0:
@@ -52,7 +45,7 @@ def decision_maps(
 def critic_maps(
     learner: ActorCritic, critic: Any, obs: Observation, mirrored: bool = False
 ) -> tuple[jax.Array, Any]:
-    """Computes Q of both critics as one [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
+    """Computes the lower Q of both critics [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
 
     Also returns the first critic's features [B, K / 2, ., ., F]. See `dense_maps` for `mirrored`.
     """
@@ -74,23 +67,20 @@ def map_critics(call: Callable[[Any], Any], variables: Any) -> Any:
 
 
 def logits(q: jax.Array, correction: jax.Array) -> jax.Array:
-    """Returns the actor's logits: the critic's map, without gradient, plus the head's output.
-
-    The policy gradient only moves a mode; the critic's map says where modes are.
-    """
+    """Returns the critic's map, which says where modes are, without gradient, plus the head's."""
     return jax.lax.stop_gradient(q) * SHARPNESS + correction
 
 
 def unfold_maps(
     learner: ActorCritic, obs: Observation, q: jax.Array, correction: jax.Array
-) -> DenseMaps:
+) -> maps.DenseMaps:
     """Builds the maps of all yaws from Q and the actor's output in the frames of the passes."""
     unfold = jax.vmap(maps.unfold)
     valid = jax.vmap(maps.actionable_cells, (None, 0))(learner.frames, obs)
-    return DenseMaps(unfold(q), unfold(logits(q, correction)), valid)
+    return maps.DenseMaps(unfold(q), unfold(logits(q, correction)), valid)
 
 
-def best_grasp(state: DenseMaps) -> jax.Array:
+def best_grasp(state: maps.DenseMaps) -> jax.Array:
     """Returns phi_g(s) of eq. 16, []: the largest valid grasp value; 0 without a valid cell."""
     valid = state.valid[Primitive.GRASP]
     best = jnp.max(jnp.where(valid, state.q[Primitive.GRASP], -jnp.inf))

@@ -3,10 +3,9 @@
 CPU: XLA is slow at convolutions with batch and channels swapped inside `lax.scan`, which autodiff
 makes. Here the swap is a transpose and every convolution is plain.
 
-GPU: the gradient of a dilated kernel is computed tap by tap. The first convolution, of few channels
-and many taps, is a matrix product. Under `vmap` of several runs XLA makes grouped convolutions,
-which are slow. By taps each is one matrix product, whose parts are shifted and added. Its product
-needs memory, so thousands of passes keep the grouped one.
+GPU: the first convolution, of few channels and many taps, is a matrix product. Under `vmap` of runs
+XLA makes slow grouped convolutions. By taps each is one product, whose parts are shifted and added:
+too large for thousands of passes.
 """
 
 import functools
@@ -66,14 +65,17 @@ def _maps_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
 def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
     """Computes d loss / d kernel [k, k, I, O]: maps, channels as batch, times the gradient.
 
-    A CPU is faster with fewer channels as batch, so it may convolve the other way round, which
-    gives the flipped kernel. It also takes rows two apart, with zeros between them: XLA's library
-    (`runtime.compiler`) leaves those to Eigen, two to three times as fast at so few outputs.
+    A GPU sums that of a dilated kernel tap by tap in float32. A CPU is faster with fewer channels
+    as batch, so it may convolve the other way round, which gives the flipped kernel. It also takes
+    rows two apart, with zeros between them: XLA's library (`runtime.compiler`) leaves those to
+    Eigen, two to three times as fast at so few outputs.
     """
     maps, kernel = saved
     size, on_cpu = kernel.shape[0], jax.default_backend() == "cpu"
-    if dilation > 1 and not on_cpu:
-        return _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient)
+    if dilation > 1 and stride == 1 and 2 * padding == dilation * (size - 1) and not on_cpu:
+        tap = functools.partial(jnp.einsum, "bhwi,bhwo->io", preferred_element_type=jnp.float32)
+        taps = jnp.stack([tap(window, gradient) for window in windows(maps, size, 1, dilation)])
+        return taps.reshape(kernel.shape).astype(kernel.dtype)
     swapped = on_cpu and stride == 1 and maps.shape[-1] > gradient.shape[-1]
     batch, window, pad = maps, gradient, padding
     if swapped:
@@ -90,21 +92,6 @@ def _kernel_gradient(stride, dilation, padding, saved, gradient) -> jax.Array:
     return jnp.moveaxis(taps, 0, 3)[::-1, ::-1] if swapped else jnp.moveaxis(taps, 0, 2)
 
 
-def _kernel_gradient_by_taps(stride, dilation, padding, saved, gradient) -> jax.Array:
-    """Computes `_kernel_gradient` tap by tap as matrix products, summed in float32."""
-    maps, kernel = saved
-    padded = jnp.pad(maps, ((0, 0), (padding, padding), (padding, padding), (0, 0)))
-    rows, cols = (stride * (length - 1) + 1 for length in gradient.shape[1:3])
-
-    def tap(row: int, col: int) -> jax.Array:
-        window = padded[:, row : row + rows : stride, col : col + cols : stride]
-        return jnp.einsum("bhwi,bhwo->io", window, gradient, preferred_element_type=jnp.float32)
-
-    offsets = range(0, dilation * kernel.shape[0], dilation)
-    taps = jnp.stack([tap(row, col) for row in offsets for col in offsets])
-    return taps.reshape(kernel.shape).astype(kernel.dtype)
-
-
 _conv2d.defvjp(
     lambda maps, kernel, *window: (_conv2d(maps, kernel, *window), (maps, kernel)),
     lambda *args: (_maps_gradient(*args), _kernel_gradient(*args)),
@@ -112,7 +99,7 @@ _conv2d.defvjp(
 
 
 def taps_fit(maps: jax.Array, kernel: jax.Array) -> bool:
-    """Checks that the products of all taps are few enough to lie in memory at once."""
+    """Checks that the products of all taps fit the memory at once."""
     return maps.size // maps.shape[-1] * (kernel.size // kernel.shape[2]) <= _MOST_PRODUCTS
 
 
@@ -135,9 +122,9 @@ def windows(maps: jax.Array, size: int, stride: int = 1, dilation: int = 1) -> l
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
 def shift_and_add(products: jax.Array, size: int, dilation: int = 1) -> jax.Array:
-    """Sums a kernel's shifted products over its taps: [B, H, W, size^2 F] -> [B, H, W, F].
+    """Sums a kernel's shifted products over its taps in float32: [B, H, W, s^2 F] -> [B, H, W, F].
 
-    Sums are float32. The gradient is written out: autodiff would pad each tap's slice with zeros.
+    The gradient is written out: autodiff would pad each tap's slice with zeros.
     """
     features = products.shape[-1] // size**2
     shifted = (
@@ -147,11 +134,9 @@ def shift_and_add(products: jax.Array, size: int, dilation: int = 1) -> jax.Arra
     return functools.reduce(jnp.add, shifted).astype(products.dtype)
 
 
-def _gradient_of_taps(size: int, dilation: int, _: None, gradient: jax.Array) -> tuple[jax.Array]:
-    taps = windows(gradient, size, dilation=dilation)
-    return (jnp.concatenate(taps[::-1], axis=-1),)
-
-
 shift_and_add.defvjp(
-    lambda products, *kernel: (shift_and_add(products, *kernel), None), _gradient_of_taps
+    lambda products, *kernel: (shift_and_add(products, *kernel), None),
+    lambda size, dilation, _, gradient: (
+        jnp.concatenate(windows(gradient, size, dilation=dilation)[::-1], axis=-1),
+    ),
 )

@@ -1,8 +1,7 @@
 """Weights of DenseNet-121 in torchvision's names to the variables of a trunk.
 
 `features.denseblock1.denselayer2.conv1.weight` [O, I, k, k] is
-`params.denseblock1.denselayer2.conv1.kernel` [k, k, I, O]; a norm's `weight`, `bias`,
-`running_mean` and `running_var` are its scale, bias, mean and variance.
+`params.denseblock1.denselayer2.conv1.kernel` [k, k, I, O].
 """
 
 from collections.abc import Mapping
@@ -19,10 +18,9 @@ _NAMES = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": 
 
 
 def variables(cfg: DenseNet121, tensors: Mapping[str, np.ndarray]) -> Any:
-    """Converts `tensors` by name to the variables of one trunk, float32 leaves [...].
+    """Converts `tensors` by name to a trunk's variables, float32, without the classifier.
 
-    The classifier and the counters of batch norm are ignored. Raises ValueError naming the first
-    tensor that is missing, misshapen or unknown.
+    Raises ValueError naming the first tensor that is missing, misshapen or unknown.
     """
     trunk, blank = densenet.DenseNetTrunk(cfg), jax.ShapeDtypeStruct((1, 32, 32, 3), jnp.float32)
     names = set()

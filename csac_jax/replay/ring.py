@@ -37,8 +37,8 @@ def bytes_needed(capacity: int, example_item: Any) -> int:
 def add(state: ReplayState, items: Any, valid: jax.Array) -> ReplayState:
     """Stores the `valid` [E] bool ones of `items`, leaves [E, ...], over the oldest.
 
-    New items take the largest stored priority, 1 in an empty ring, so that none is ranked above
-    them. A scatter to slots that are all different: with the state donated, XLA writes in place.
+    New items take the largest stored priority, 1 in an empty ring. A scatter to slots that are all
+    different: with the state donated, XLA writes in place.
     """
     capacity, num = state.priority.shape[0], valid.shape[0]
     if num > capacity:
@@ -70,7 +70,7 @@ def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) 
 
     A slot that occurs twice keeps the larger one: by `min` to 0 and `max`, as the order of
     conflicting `set`s is undefined. A non-finite one counts as the largest that these slots have or
-    had: the transition is replayed again, and no NaN gets into the ranking.
+    had.
     """
     finite = jnp.isfinite(priorities)
     known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)

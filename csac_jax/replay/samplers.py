@@ -119,8 +119,8 @@ def _ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Arr
     """Sorts slots [C] by falling value, filled ones first; also returns their number [].
 
     Equal values share their ranks at random: by slot, the oldest would be preferred. Of a ring of
-    more than SORTED slots, CANDIDATES random ones are sorted. The rank among all then deviates by
-    at most n / (2 sqrt(CANDIDATES)): no decile's share changes by 0.001.
+    more than SORTED slots, CANDIDATES random ones are sorted. That spreads a rank by up to n / (2
+    sqrt(CANDIDATES)), and changes no decile's share by 0.001.
     """
     if values.shape[0] > SORTED:
         some = jax.random.randint(key, (CANDIDATES,), 0, jnp.maximum(size, 1), jnp.int32)
@@ -135,14 +135,6 @@ def _ranked(key: jax.Array, values: jax.Array, size: jax.Array) -> tuple[jax.Arr
 def _descending(values: jax.Array) -> jax.Array:
     """Returns keys [C] that sort `values` [C] from the largest down, NaN first."""
     return -jnp.where(jnp.isnan(values), jnp.inf, values)
-
-
-def newest_slots(key: jax.Array, state: ReplayState, among: int, num: int) -> jax.Array:
-    """Draws a slot [num] from each of `num` equal parts of the `among` >= `num` newest."""
-    part = jnp.arange(num, dtype=jnp.float32) + jax.random.uniform(key, (num,))
-    age = jnp.minimum(jnp.floor(part * (among / num)).astype(jnp.int32), among - 1)
-    age = jnp.clip(age, 0, jnp.maximum(state.size - 1, 0))
-    return (state.head - 1 - age) % state.priority.shape[0]
 
 
 def opposite_slots(
@@ -196,10 +188,7 @@ def _log_gamma(key: jax.Array, shape: ArrayLike, num: int) -> jax.Array:
 
 
 def beta_schedule(cfg: BetaReplay, progress: jax.Array) -> list[jax.Array]:
-    """Returns a and b of the Beta law, each [], at the share `progress` of all updates; sec. 3.5.
-
-    Linear from `start` to `middle` at `middle_at`, and on to `end` at 1; constant outside 0 .. 1.
-    """
+    """Interpolates a and b of the Beta law, each [], at the share `progress` of all updates."""
     knots = jnp.asarray([0.0, cfg.middle_at, 1.0], jnp.float32)
     laws = zip(cfg.start, cfg.middle, cfg.end, strict=True)
     return [jnp.interp(progress, knots, jnp.asarray(law, jnp.float32)) for law in laws]
@@ -225,8 +214,8 @@ class Uniform(_Configured):
 class Prioritised(_Configured):
     """P(i) ~ (abs(TD error) + epsilon)^alpha, w_i = (n P(i))^-beta / max_j w_j; Schaul et al. 2016.
 
-    n and the sum of all masses cancel: w_i = (min_j m_j / m_i)^beta. The maximum is the batch's: by
-    the ring's least likely transition all steps would be small.
+    n and sum m cancel: w_i = (min_j m_j / m_i)^beta, with the batch's minimum, as the ring's would
+    make all steps small.
     """
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
@@ -261,7 +250,11 @@ class Opposite(_Configured):
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         key_new, key_opposite = jax.random.split(key)
         num_new = num - num // 2
-        new = newest_slots(key_new, state, max(self.scenes, num_new), num_new)
+        among = max(self.scenes, num_new)
+        part = jnp.arange(num_new, dtype=jnp.float32) + jax.random.uniform(key_new, (num_new,))
+        age = jnp.minimum(jnp.floor(part * (among / num_new)).astype(jnp.int32), among - 1)
+        age = jnp.clip(age, 0, jnp.maximum(state.size - 1, 0))
+        new = (state.head - 1 - age) % state.priority.shape[0]
         opposite, has_match = opposite_slots(key_opposite, state, new[: num // 2], *self.cfg.law)
         weights = jnp.append(jnp.ones(num_new), has_match.astype(jnp.float32))
         return Sample(jnp.append(new, opposite), weights)
