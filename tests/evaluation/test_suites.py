@@ -160,7 +160,7 @@ def test_target_suite(monkeypatch: pytest.MonkeyPatch):
             scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
             varied = env.randomise_pose(jax.random.key(0), scene)
             assert scene.in_play[varied.target]
-    with pytest.raises(ValueError, match="^suite: target needs a policy trained"):
+    with pytest.raises(ValueError, match=r"^suite: target needs a policy trained"):
         suites.prepare(CFG, "target", EPISODES, 0)
 
 
