@@ -169,23 +169,14 @@ def test_acting_does_not_wait_for_what_learns():
 def test_what_acts_is_there_first(monkeypatch: pytest.MonkeyPatch):
     """Claim: a chunk is compiled as soon as it can act, by the thread that asks, so that it sees
     whether the cache had it; what learns compiles after that."""
-    go_on, threads = threading.Event(), []
-
-    def learns() -> str:
-        assert go_on.wait(60.0)
-        return "learns"
-
-    def acts() -> str:
-        threads.append(threading.current_thread())
-        return "acts"
-
-    half = SimpleNamespace(lower=lambda: SimpleNamespace(compile=learns))
+    go_on = threading.Event()
+    half = SimpleNamespace(lower=lambda: SimpleNamespace(compile=lambda: go_on.wait(60.0)))
     monkeypatch.setattr(trace_cache, "jit", lambda *_: half)
-    act = SimpleNamespace(out_info=(), compile=acts)
+    act = SimpleNamespace(out_info=(), compile=threading.current_thread)
     chunk = split_step._Split(mock.Mock(), T, False, act).compile()
-    assert (chunk.act, chunk.learn.done(), threads) == ("acts", False, [threading.main_thread()])
+    assert (chunk.act, chunk.learn.done()) == (threading.main_thread(), False)
     go_on.set()
-    assert chunk.learn.result(60.0) == "learns"
+    assert chunk.learn.result(60.0)
 
 
 def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
@@ -268,8 +259,8 @@ def test_seeds_differ(run):
 
 
 def test_scenes_and_steps_differ(run):
-    """Claim: every scene and every step has randomness of its own: alike scenes, looked at by one
-    and the same network, are acted on in different ways, and at each step in others."""
+    """Claim: alike scenes, looked at by the same network, are acted on in different ways, and at
+    each step in others."""
     state = run.states[1]
     alike = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), state.scenes)
     first = int(state.replay.size)  # where the next actions are stored
@@ -393,16 +384,13 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     num = CFG.learn.batch
     weights, error = jnp.linspace(0.5, 1.0, num), jnp.linspace(-1.0, 1.0, num)
 
-    def draw(self, key, state, progress, num):
-        return samplers.Sample(2 * jnp.arange(num, dtype=jnp.int32), weights)
-
-    def update(self, key, state, batch, given):
-        return state, UpdateInfo(jnp.sum(given * error), jnp.float32(0.0), error)
+    def update(self, key, state, batch, weights):
+        return state, UpdateInfo(jnp.sum(weights * error), jnp.float32(0.0), error)
 
     nothing: Any = None
-    cfg = CFG.change(replay={"capacity": 64, "sampler": sampler})
-    made = samplers.make(cfg.replay)
-    monkeypatch.setattr(type(made), "sample", draw)
+    cfg, slots = CFG.change(replay={"capacity": 64, "sampler": sampler}), 2 * jnp.arange(num)
+    made, drawn = samplers.make(cfg.replay), samplers.Sample(slots, weights)
+    monkeypatch.setattr(type(made), "sample", lambda *_: drawn)
     monkeypatch.setattr(PrioritisedReplay, "alpha", 0.5)
     monkeypatch.setattr(PrioritisedReplay, "per_epsilon", 0.25)
     monkeypatch.setattr(CSAC, "update", update)
@@ -410,8 +398,8 @@ def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     replay = ring.init(jnp.full(64, 7.0), programs.example(cfg)).replace(size=jnp.int32(64))
     learner_state = actor_critic.LearnerState(None, None, None, None, jnp.int32(0))
     program = Program(cfg, nothing, CSAC(nothing), made)
-    key, done = jax.random.key(0), jnp.int32(0)
-    _, priority, losses = step.learn(program, key, learner_state, replay, done)
+    inputs = jax.random.key(0), learner_state, replay, jnp.int32(0)
+    _, priority, losses = step.learn(program, *inputs)
     np.testing.assert_allclose(losses["critic_loss"], np.sum(weights * error), rtol=1e-5)
     expected, size = np.full(64, 7.0), np.abs(error)
     expected[: 2 * num : 2] = np.sqrt(size + 0.25) if sampler == "prioritised" else size
