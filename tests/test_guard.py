@@ -4,8 +4,8 @@ import importlib.metadata
 import os
 import subprocess
 import sys
-import textwrap
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -48,14 +48,8 @@ def _python(source: str, timeout: float = 60.0, **variables: str) -> subprocess.
     """Runs `source` in a fresh Python, with no variable of the guard but `variables`."""
     guarded = (*_guard.USER_VARIABLES, "XLA_FLAGS", _guard.PARTITIONER_VARIABLE)
     inherited = {name: value for name, value in os.environ.items() if name not in guarded}
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(source)],
-        env={**inherited, **variables},
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        cwd=ROOT,
-    )
+    pipes: Any = {"capture_output": True, "text": True, "timeout": timeout, "cwd": ROOT}
+    return subprocess.run([sys.executable, "-c", source], env={**inherited, **variables}, **pipes)
 
 
 @pytest.mark.slow
@@ -76,11 +70,9 @@ def test_import_widens_the_pool():
 @pytest.mark.parametrize("name", ["PJRT_NPROC", "NPROC"])
 def test_user_setting_is_kept(name: str):
     """Claim: what the user has set decides."""
-    source = """
-    import csac_jax, os
-    from csac_jax import _guard
-    print(os.environ.get("PJRT_NPROC"), *_guard.pool_setting())
-    """
+    source = (
+        "import csac_jax as c, os; print(os.environ.get('PJRT_NPROC'), *c._guard.pool_setting())"
+    )
     done = _python(source, **{name: "3"})
     assert done.stdout.split() == ["3" if name == "PJRT_NPROC" else "None", name, "3"]
 
@@ -140,23 +132,9 @@ def test_programs_of_several_devices_take_empty_constants():
     assert done.stdout == "[0. 1. 2. 3.]\n"
 
 
-@pytest.fixture
-def partitioner():
-    """JAX's choice of a partitioner, put back afterwards."""
-    used = jax.config.jax_use_shardy_partitioner
-    yield
-    jax.config.update("jax_use_shardy_partitioner", used)
-
-
-@pytest.mark.usefixtures("partitioner")
 @pytest.mark.parametrize(
     ("version", "before", "after"),
-    [
-        ("0.11.2", None, "false"),
-        ("0.11.2", "true", "true"),
-        ("0.10.1", None, None),
-        ("0.12.0", None, None),
-    ],
+    [("0.11.2", None, "false"), ("0.11.2", "true", "true"), ("0.12.0", None, None)],
 )
 def test_broken_partitioner_is_not_used(
     monkeypatch: pytest.MonkeyPatch, version: str, before: str | None, after: str | None
@@ -167,7 +145,11 @@ def test_broken_partitioner_is_not_used(
     monkeypatch.setenv(_guard.PARTITIONER_VARIABLE, before or "")  # to be put back
     if before is None:
         monkeypatch.delenv(_guard.PARTITIONER_VARIABLE)
+    used = jax.config.jax_use_shardy_partitioner
     jax.config.update("jax_use_shardy_partitioner", True)
-    _guard.switch_off_broken_partitioner()
-    assert os.environ.get(_guard.PARTITIONER_VARIABLE) == after
-    assert jax.config.jax_use_shardy_partitioner == (after != "false")
+    try:
+        _guard.switch_off_broken_partitioner()
+        assert os.environ.get(_guard.PARTITIONER_VARIABLE) == after
+        assert jax.config.jax_use_shardy_partitioner == (after != "false")
+    finally:
+        jax.config.update("jax_use_shardy_partitioner", used)

@@ -129,9 +129,8 @@ def prepare(
         )
     else:
         parts = SUITES[suite].build(cfg, episodes, 1 + seed)
-    return PreparedSuite(
-        suite, cfg, parts if isinstance(parts, dict) else {suite: parts}, episodes, seed
-    )
+    parts = parts if isinstance(parts, dict) else {suite: parts}
+    return PreparedSuite(suite, cfg, parts, episodes, seed)
 
 
 def check(suite: str) -> None:

@@ -1,7 +1,4 @@
-"""Processes of one sweep on several hosts, each with the devices of its host, in one mesh.
-
-Every process runs the same command and sees the sweep's folder; the first alone logs.
-"""
+"""Processes of one sweep on several hosts, with their devices in one mesh; the first alone logs."""
 
 import jax
 import numpy as np

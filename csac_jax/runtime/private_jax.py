@@ -1,7 +1,4 @@
-"""Parts of JAX that have no public name. `runtime.host_call` also relies on XLA's binary interface.
-
-Tests of what is built on them show whether a new version of JAX still has them.
-"""
+"""Parts of JAX that have no public name. `runtime.host_call` also relies on XLA's interface."""
 
 from jax._src import compilation_cache
 

@@ -50,9 +50,7 @@ def commit() -> str | None:
     folder = Path(__file__).resolve().parent
     if _git(folder, "ls-files", Path(__file__).name) is None:
         return None  # installed into some other project's checkout
-    name = _git(folder, "rev-parse", "HEAD")
-    changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    return f"{name}-dirty" if name and changed else name
+    return _git(folder, "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*")
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -102,11 +102,10 @@ def kind_of(name: str) -> object:
         raise SettingsError("vary: leave seed out; give the number of seeds")
     kinds: dict[str, object] = {"algo": str, **dict.fromkeys(BUNDLES, str)}
     for section, default in vars(Config()).items():
-        if isinstance(default, Section):
-            _, alternatives = ALTERNATIVES.get(section, ("", (type(default),)))
-            for kind in typing.cast(Any, alternatives):
-                hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
-                kinds |= {f"{section}.{field.name}": hints[field.name] for field in fields}
+        alternatives: Any = ALTERNATIVES.get(section, ("", (type(default),)))[1]
+        for kind in alternatives if isinstance(default, Section) else ():
+            hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
+            kinds |= {f"{section}.{field.name}": hints[field.name] for field in fields}
     if name not in kinds:
         near = difflib.get_close_matches(name, kinds, 1)
         hint = f"perhaps you meant {near[0]}" if near else "see docs/reference/settings.md"

@@ -1,7 +1,7 @@
-"""Many runs in one program: replicas, which differ in seed and hyper-parameters.
+"""Many runs in one program: S replicas, which differ in seed and hyper-parameters.
 
-S = replicas. `step.train_step` is written for one run and vmapped here, once. All leaves of a state
-but `step` have a leading axis S: replicas share the counter, so that a schedule stays a branch.
+`step.train_step` is vmapped here, once. All leaves of a state but `step` have a leading axis S:
+replicas share the counter, so that a schedule stays a branch.
 """
 
 import dataclasses

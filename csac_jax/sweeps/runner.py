@@ -55,18 +55,6 @@ class SweepPlan(NamedTuple):
     episodes: int = 0  # that every final policy is evaluated in
 
 
-class SweepRun(NamedTuple):
-    """One run of a sweep."""
-
-    point: str
-    cfg: Config
-
-    @property
-    def folder(self) -> Path:
-        """Returns the folder of its log and checkpoint, within the sweep's."""
-        return Path(self.point) / f"seed-{self.cfg.seed}"
-
-
 class SweepResult(NamedTuple):
     """The end of a sweep."""
 
@@ -168,27 +156,27 @@ def check_plan(plan: SweepPlan) -> None:
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
     """Raises ValueError if a run has begun with another config than the plan's, or elsewhere."""
-    for run in runs_of(plan):
-        if not (folder / run.folder).resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{run.folder} is a link out of the sweep's folder")
-        if (path := folder / run.folder / files.CONFIG).exists():
+    for run, cfg in runs_of(plan).items():
+        if not (folder / run).resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{run} is a link out of the sweep's folder")
+        if (path := folder / run / files.CONFIG).exists():
             stored = configs.from_dict(files.read_object(path))
-            if names := configs.differences(stored, run.cfg):
-                raise ValueError(f"{run.folder} has other values of {', '.join(names)}")
+            if names := configs.differences(stored, cfg):
+                raise ValueError(f"{run} has other values of {', '.join(names)}")
 
 
-def runs_of(plan: SweepPlan) -> list[SweepRun]:
-    """Returns every point with every seed."""
-    return [
-        SweepRun(point.name, dataclasses.replace(point.cfg, seed=point.cfg.seed + k))
-        for point in plan.points
+def runs_of(plan: SweepPlan) -> dict[Path, Config]:
+    """Returns every point with every seed: the config by the run's folder in the sweep's."""
+    return {
+        Path(name, f"seed-{cfg.seed + k}"): dataclasses.replace(cfg, seed=cfg.seed + k)
+        for name, _, cfg in plan.points
         for k in range(plan.seeds)
-    ]
+    }
 
 
-def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[SweepRun]]]:
+def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[Path]]]:
     """Groups the runs of a plan, in order. Raises SettingsError if points are equal."""
-    runs = {run.cfg: run for run in runs_of(plan)}
+    runs = {cfg: run for run, cfg in runs_of(plan).items()}
     if len(runs) < plan.seeds * len(plan.points):
         raise SettingsError("vary: two settings have the same values; leave one of them out")
     return [(group, [runs[cfg] for cfg in group.configs]) for group in group_configs(list(runs))]
@@ -206,7 +194,7 @@ class _Sweep:
     """A sweep that runs."""
 
     folder: Path
-    groups: list[tuple[ProgramGroup, list[SweepRun]]]
+    groups: list[tuple[ProgramGroup, list[Path]]]
     reporter: loop.Reporter
     stop: Stop
     stopped: int | None = None  # number of the signal that all processes know of
@@ -219,7 +207,7 @@ class _Sweep:
 
     def train_group(self, index: int, folder: Path, program: SweepProgram) -> None:
         """Trains a group, which has `folder` to itself, to its end or to a signal."""
-        training = _GroupTraining(self.folder, folder, self.groups[index][1], program)
+        training = _GroupTraining(self.folder, folder, *self.groups[index], program)
         self.reporter.log(f"group {index + 1} of {len(self.groups)}: {training.title()}")
         chunk = None
         while not training.over() and not self.stopping():
@@ -242,7 +230,7 @@ class _Sweep:
             values = [getattr(record, name) for record in records]
             return loop.mean([value for value in values if value is not None])
 
-        cfgs = [[run.cfg for run in runs] for _, runs in self.groups]
+        cfgs = [group.configs for group, _ in self.groups]
         actions = [sum(loop.total_steps(cfg) * cfg.train.scenes for cfg in group) for group in cfgs]
         done = sum(actions[:index]) + records[0].actions * len(cfgs[index])
         total, speed = sum(actions), sum(record.actions_per_second for record in records)
@@ -260,11 +248,12 @@ class _GroupTraining:
     """A group that trains: its state and the host's state of each run."""
 
     def __init__(
-        self, sweep_folder: Path, folder: Path, runs: list[SweepRun], program: SweepProgram
+        self, sweep: Path, folder: Path, group: ProgramGroup, runs: list[Path], program: Any
     ) -> None:
         """Restores the newest checkpoint, if there is one, and cuts the logs to it."""
-        self.folder, self.runs, self.program, self.cfg = folder, runs, program, runs[0].cfg
-        self.paths = [sweep_folder / run.folder for run in runs]
+        self.folder, self.runs, self.program = folder, runs, program
+        self.cfgs, self.cfg = group.configs, group.configs[0]
+        self.paths = [sweep / run for run in runs]
         self.loop_states = [loop.LoopState(0.0, [])] * len(runs)
         self.failed: list[int | None] = [None] * len(runs)  # step of a loss that is not finite
         if checkpoint.latest_step(folder) is None:
@@ -278,13 +267,13 @@ class _GroupTraining:
         self.step = int(self.state.step)
         self.saved = self.step if self.step else None
         if cluster.is_first():
-            for run, path in zip(runs, self.paths, strict=True):
+            for cfg, path in zip(self.cfgs, self.paths, strict=True):
                 path.mkdir(parents=True, exist_ok=True)
-                files.write_json(path / files.CONFIG, configs.to_dict(run.cfg))
+                files.write_json(path / files.CONFIG, configs.to_dict(cfg))
                 files.truncate_log(path / files.METRICS, self.step)
 
     def title(self) -> str:
-        names = list(dict.fromkeys(run.point for run in self.runs))
+        names = list(dict.fromkeys(run.parent.name for run in self.runs))
         more = f" and {len(names) - 4} more" if len(names) > 4 else ""
         since = f", resumed at step {self.step}" if self.step else ""
         return f"{len(self.runs)} runs, {', '.join(names[:4])}{more}{since}"
@@ -298,16 +287,16 @@ class _GroupTraining:
         self.state, metrics, seconds = loop.timed(chunk, self.state)
         self.step += self.cfg.train.chunk
         records = []
-        for i, run in enumerate(self.runs):
+        for i, cfg in enumerate(self.cfgs):
             run_metrics = jax.tree.map(lambda leaf, i=i: leaf[:, i], metrics)
             if self.failed[i] is None and (name := loop.not_finite(run_metrics)):
                 self.failed[i] = self.step
                 reason = f"given up at step {self.step}, {name} is not finite"
-                reporter.log(f"{run.point}, seed {run.cfg.seed}: {reason}")
+                reporter.log(f"{self.runs[i].parent}, seed {cfg.seed}: {reason}")
             if self.failed[i] is None:
-                self.loop_states[i], record = loop.record_chunk(
-                    run.cfg, self.step, run_metrics, self.loop_states[i], seconds
-                )
+                before = self.loop_states[i]
+                after, record = loop.record_chunk(cfg, self.step, run_metrics, before, seconds)
+                self.loop_states[i] = after
                 records.append(record)
                 if cluster.is_first():
                     loop.append(self.paths[i], record)
@@ -325,7 +314,7 @@ class _GroupTraining:
         for i, path in enumerate(self.paths):
             if self.failed[i] is None:
                 state, extra = self.program.replica(self.state, i), self.loop_states[i]._asdict()
-                checkpoint.save(path, self.step, state, self.runs[i].cfg, extra)
+                checkpoint.save(path, self.step, state, self.cfgs[i], extra)
         if cluster.is_first():
             files.replace(self.folder / "done", "")
             shutil.rmtree(self.folder / checkpoint.FOLDER, ignore_errors=True)
@@ -337,7 +326,8 @@ def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
     run with another number of steps than the plan's does not count."""
     points: list[dict[str, Any]] = []
     for point in plan.points:
-        rows = [_row(folder, run) for run in runs_of(plan._replace(points=[point]))]
+        runs = runs_of(plan._replace(points=[point]))
+        rows = [_row(folder, run, cfg) for run, cfg in runs.items()]
         done = [row["grasp_success"] for row in rows if row["complete"]]
         known = np.array([value for value in done if value is not None])
         success = statistics.band([known])._asdict() if known.size else dict(NO_CASES)
@@ -347,13 +337,9 @@ def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
     return {"seeds": plan.seeds, "complete": complete, "settings": points}
 
 
-def _row(folder: Path, run: SweepRun) -> dict[str, Any]:
-    log = folder / run.folder / files.METRICS
-    lines = files.read_log(log) if log.exists() else []
-    last = lines[-1] if lines else _NO_LINE
-    return {
-        "seed": run.cfg.seed,
-        "run_dir": run.folder.as_posix(),
-        "complete": last["step"] == loop.total_steps(run.cfg),
-        **{name: last[name] for name in _NO_LINE},
-    }
+def _row(folder: Path, run: Path, cfg: Config) -> dict[str, Any]:
+    log = folder / run / files.METRICS
+    last = [_NO_LINE, *(files.read_log(log) if log.exists() else [])][-1]
+    complete = last["step"] == loop.total_steps(cfg)
+    known = {"seed": cfg.seed, "run_dir": run.as_posix(), "complete": complete}
+    return known | {name: last[name] for name in _NO_LINE}

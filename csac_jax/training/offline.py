@@ -1,7 +1,4 @@
-"""Learning from stored transitions: the updates of a training step, without scenes.
-
-The ring is full from the start and nothing is added. n = transitions.
-"""
+"""Learning from n stored transitions, which fill the ring: a training step without scenes."""
 
 import functools
 from typing import Any

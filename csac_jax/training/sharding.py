@@ -48,9 +48,10 @@ def make(devices: int | None) -> Mesh | None:
 
 def check(mesh: Mesh | None, shard: Shard, runs: int, scenes: int, batch: int) -> None:
     """Raises SettingsError if the devices cannot divide the runs, or scenes and batch, evenly."""
-    size = 1 if mesh is None else mesh.size
-    by_scenes = {"train.scenes": scenes, "learn.batch": batch}
-    for name, number in ({"seeds": runs} if shard == "seeds" else by_scenes).items():
+    size, divided = 1 if mesh is None else mesh.size, {"seeds": runs}
+    if shard == "scenes":
+        divided = {"train.scenes": scenes, "learn.batch": batch}
+    for name, number in divided.items():
         if number % size:
             remedy = f"give a multiple of {size}, or another number of devices"
             raise SettingsError(f"{name}: {number} does not divide among {size} devices; {remedy}")

@@ -1,8 +1,7 @@
 """A chunk of training steps as two programs, the halves of `step.train_step`.
 
 On a CPU compiling takes longer than a run's first steps. So acting begins while the other half
-compiles, and updates that would be dropped are not made. Elsewhere a chunk is one program: a step
-is many small kernels there, and the host would keep them waiting.
+compiles, and updates that would be dropped are not made. Elsewhere a chunk is one program.
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor

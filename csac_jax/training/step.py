@@ -1,7 +1,4 @@
-"""The algorithm: one training step of all scenes, CSAC Algorithm 1.
-
-Act, simulate, replace finished scenes, remember, learn. E = scenes, B = batch.
-"""
+"""The algorithm: one training step of all scenes, CSAC Algorithm 1. E = scenes, B = batch."""
 
 import dataclasses
 from typing import Any

@@ -96,18 +96,13 @@ def name(program: Program, half: str, leaves: list[Any], tree: Any) -> str:
     """Returns a digest of all that decides the trace, for arguments of these leaves and tree."""
     cfg, env = program.cfg, program.env
     parts = (
-        dataclasses.replace(cfg, seed=0, preset=""),
-        half,
-        env.physics.world.digest,
-        env.gripper,
-        (env.any_yaw, env.max_failures),
+        (dataclasses.replace(cfg, seed=0, preset=""), half, env.physics.world.digest),
+        (env.gripper, env.any_yaw, env.max_failures),
         object_slots.library(cfg.scene).sha256 if cfg.scene.has_objects else "",
         sorted(provenance.versions().items()),
         sorted(item for item in jax.config.values.items() if not _UNTRACED.search(item[0])),
-        compiler.options(cfg),
         [(leaf.shape, str(leaf.dtype)) for leaf in leaves],
-        str(tree),
-        _sources(),
+        (compiler.options(cfg), str(tree), _sources()),
     )
     digest = hashlib.sha256(repr(parts).encode())
     for array in jax.tree.leaves(env.scenes):

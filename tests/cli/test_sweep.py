@@ -129,7 +129,7 @@ def test_settings_reach_their_configs():
         for change in changes
     ]
     assert plan.points[1].name == "algo=csac,target.gamma=0.3"
-    assert [one.cfg.seed for one in runner.runs_of(plan)[:3]] == [7, 8, 9]
+    assert [cfg.seed for cfg in runner.runs_of(plan).values()][:3] == [7, 8, 9]
 
 
 def test_plan_survives_its_file(tmp_path: Path):
@@ -306,7 +306,7 @@ def test_study_can_begin_and_go_on(arguments: list[str], tmp_path: Path):
     options, plan = command.read(arguments)
     assert arguments[0] == "paper_small"
     assert [words[8] for words in _study_commands()].count(str(options.run_dir)) == 1
-    seeds = {run.cfg.seed for run in runner.runs_of(plan)}
+    seeds = {cfg.seed for cfg in runner.runs_of(plan).values()}
     assert (seeds, plan.episodes) == (set(range(100, 150)), 500)
     (tmp_path / "sweep.json").write_text(runner.plan_text(plan))
     assert runner.read_plan(tmp_path) == plan

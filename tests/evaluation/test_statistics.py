@@ -84,21 +84,6 @@ def test_bootstrap_draws_seeds_then_hosts():
     assert abs((flat.high - flat.low) - (result.high - result.low)) > 0.2
 
 
-def test_more_hosts_do_not_narrow_the_band_of_seeds():
-    """Claim: a run repeated on hosts that agree leaves the band as it was."""
-    values = np.random.default_rng(4).normal(size=5)
-    once = statistics.band([values])
-    again = statistics.band([[np.full(9, value) for value in values]])
-    assert again.value == pytest.approx(once.value)
-    assert again.high - again.low == pytest.approx(once.high - once.low, rel=0.03)
-
-
-def test_values_are_grouped_by_seed():
-    """Claim: a stratum has an array of values for each seed, in the order of appearance."""
-    grouped = statistics.by_seed([4, 2, 4, 7], [0.1, 0.2, 0.3, 0.4])
-    assert [one.tolist() for one in grouped] == [[0.1, 0.3], [0.2], [0.4]]
-
-
 def test_improvement_is_mann_whitney():
     """Claim: the probability of improvement is SciPy's Mann-Whitney U over the pairs, ties by half,
     mean over strata; its band is SciPy's percentile bootstrap."""

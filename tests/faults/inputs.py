@@ -210,8 +210,8 @@ def _numbers(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Changes numbers of a plan with its digest kept or removed; the runs' own configs count."""
     path, read, expected = _sweep(folder)
     whole = json.loads(path.read_text())
-    for run in runner.runs_of(_plan()):
-        files.write_json(folder / run.folder / files.CONFIG, configs.to_dict(run.cfg))
+    for run, cfg in runner.runs_of(_plan()).items():
+        files.write_json(folder / run / files.CONFIG, configs.to_dict(cfg))
     for number in tally.each(range(tries)):
         changed = _copied(whole)
         places = [place for place in _places(changed["settings"]) if _is_number(place)]
@@ -421,7 +421,7 @@ def _plans(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
     def read() -> None:
         plan = runner.read_plan(folder)
-        places = [(folder / run.folder).resolve() for run in runner.runs_of(plan)]
+        places = [(folder / run).resolve() for run in runner.runs_of(plan)]
         if len(set(places)) == len(places) and all(
             folder.resolve() in one.parents for one in places
         ):

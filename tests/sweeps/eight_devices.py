@@ -1,6 +1,11 @@
-"""Compares replicas on eight virtual devices with those on one, with a small step; prints JSON.
+"""Training on eight virtual devices, compared with one; prints JSON.
 
-python -m tests.sweeps.eight_devices FOLDER
+python -m tests.sweeps.eight_devices toy FOLDER    replicas, by a small step
+python -m tests.sweeps.eight_devices real          a scene of `smoke` on each device
+python -m tests.sweeps.eight_devices seeds         compiles for a seed on each, without Shardy
+
+Physics are C's, which take scenes one by one: MJX rounds a batch of one scene otherwise than one of
+eight.
 """
 
 import dataclasses
@@ -14,7 +19,9 @@ import csac_jax  # noqa: F401  (before JAX)
 import jax  # isort: skip
 import numpy as np
 
+from csac_jax import presets
 from csac_jax.io import checkpoint
+from csac_jax.runtime import compiler
 from csac_jax.sweeps import replicas
 from csac_jax.training import programs, sharding, step
 from tests.training import toys
@@ -22,9 +29,12 @@ from tests.training.test_step import leaves
 
 SEEDS = {"seeds": 8, "scenes": 2}
 STEPS = 4
+REAL_STEPS = 8
+SMOKE = presets.smoke().change(sim={"physics": "c"})
+CFG = SMOKE.change(train={"scenes": 8, "actions": 8 * REAL_STEPS})  # learns from the first step
 
 
-def run(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
+def run_toy(shard: str, devices: int, folder: Path) -> tuple[Any, list[Any], Any]:
     """Returns the state after two chunks, their metrics, and the second chunk's state from a
     checkpoint of the first."""
     cfg, mesh = toys.CFG, sharding.make(devices)
@@ -52,11 +62,11 @@ def difference(a: Any, b: Any) -> float:
     return max(float(np.max(error)) for error in errors)
 
 
-def compare(shard: str, folder: Path) -> dict[str, Any]:
+def compare_toy(shard: str, folder: Path) -> dict[str, Any]:
     """Compares one device and eight."""
     folders = [folder / f"{shard}-{n}" for n in (1, 8)]
     (one, seen, _), (eight, others, again) = (
-        run(shard, n, path) for n, path in zip((1, 8), folders, strict=True)
+        run_toy(shard, n, path) for n, path in zip((1, 8), folders, strict=True)
     )
     abstract = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), one)
     by_one, by_eight = (checkpoint.restore(path, abstract)[0] for path in folders)  # read on one
@@ -71,7 +81,49 @@ def compare(shard: str, folder: Path) -> dict[str, Any]:
     }
 
 
-if __name__ == "__main__":
+def run_real(program: step.Program, devices: int) -> tuple[Any, Any]:
+    """Returns state and metrics [T, 1, ...] after REAL_STEPS steps."""
+    (group,) = replicas.group_configs([program.cfg])
+    line = sharding.make(devices)
+    together = replicas.SweepProgram(program, replicas.group_replicas(group), line, "scenes")
+    return jax.device_get(together.compile_chunk(REAL_STEPS)(together.init()))
+
+
+def compare_real() -> dict[str, Any]:
+    """Compares integers by their number of differences, floats by their largest difference."""
+    program = programs.make(CFG)
+    (state, seen), (others_state, others_seen) = run_real(program, 1), run_real(program, 8)
+    pairs = list(zip(seen, others_seen, strict=True))
+    floats = [pair for pair in pairs if pair[0].dtype == np.float32]
+    return {
+        "counts": sum(int(np.sum(x != y)) for x, y in pairs if x.dtype != np.float32),
+        "metrics": difference([x for x, _ in floats], [y for _, y in floats]),
+        "scenes": difference(state.scenes, others_state.scenes),
+        "stored": difference(state.replay.items, others_state.replay.items),
+        "critic": difference(state.learner.online.critic, others_state.learner.online.critic),
+        "learned": int(np.sum(seen.learned)),
+        "grasps": int(np.sum(seen.primitive)),
+    }
+
+
+def compile_seeds() -> dict[str, Any]:
+    """Returns on how many devices the compiled step runs, by the partitioner before Shardy."""
+    jax.config.update("jax_use_shardy_partitioner", False)  # as jaxlib 0.11 does, see `_guard`
+    seeds = [dataclasses.replace(SMOKE, seed=k) for k in range(8)]
+    (group,) = replicas.group_configs(seeds)
+    program = replicas.sweep_program(group, sharding.make(8))
+    chunk = compiler.lower(program.compile_chunk(1), program.abstract()).compile()
+    return {"used": len(jax.tree.leaves(chunk.output_shardings)[0].device_set)}
+
+
+def toy(folder: Path) -> dict[str, Any]:
+    """Compares both ways of sharding."""
     programs.init_state, step.train_step = toys.init_state, toys.train_step
-    results = {shard: compare(shard, Path(sys.argv[1])) for shard in SEEDS}
+    return {shard: compare_toy(shard, folder) for shard in SEEDS}
+
+
+if __name__ == "__main__":
+    kind, *arguments = sys.argv[1:]
+    work = {"toy": toy, "real": compare_real, "seeds": compile_seeds}[kind]
+    results = work(*map(Path, arguments))
     print(json.dumps({"devices": len(jax.devices()), **results}))

@@ -120,7 +120,7 @@ def test_every_run_is_one_of_train(uninterrupted):
     two are alike."""
     folder, *_ = uninterrupted
     configs = [checkpoint.load_config(folder / name / f"seed-{seed}") for name, seed in _runs()]
-    assert configs == [one.cfg for one in runner.runs_of(PLAN)]
+    assert configs == list(runner.runs_of(PLAN).values())
     for name, seed in _runs():
         log = test_loop._log(folder / name / f"seed-{seed}")
         assert [line["step"] for line in log] == [4 * n for n in range(1, CHUNKS + 1)]

@@ -1,5 +1,6 @@
 """The host loop, with a tiny program in place of the learner."""
 
+import functools
 import json
 import math
 import re
@@ -45,18 +46,15 @@ def _init() -> State:
 class Fake:
     """A program of random metrics that counts compilations and can fail in several ways."""
 
-    def __init__(
-        self, nan_at: int = -1, ill_from: int = 99, ill_to: int = 99, lost_at: int = -1
-    ) -> None:
+    def __init__(self, nan_at=-1, ill_from=99, ill_to=99, lost_at=-1) -> None:
         self.compiled: list[int] = []
         self._nan_at, self._ill, self._lost_at = nan_at, (ill_from, ill_to), lost_at
 
     def compile_chunk(self, num_steps: int):
         """Stands in for `programs.compile_chunk`, with the program bound."""
         self.compiled.append(num_steps)
-        return jax.jit(
-            lambda state: jax.lax.scan(self._step, state, length=num_steps), donate_argnums=0
-        )
+        scan = functools.partial(jax.lax.scan, self._step, length=num_steps)
+        return jax.jit(lambda state: scan(state), donate_argnums=0)
 
     def _step(self, state: State, _):
         keys = jax.random.split(jax.random.fold_in(state.key, state.step), 4)
@@ -239,8 +237,8 @@ def test_warnings_come_once(tmp_path: Path):
         listener = Listener()
         _run(tmp_path / name, listener, fake, cfg=cfg)
         assert sum(text in line for line in listener.said) == times, name
-        if name == "one":
-            assert sum(record.physics_diverged for record in listener.records) == 1
+        counted = sum(record.physics_diverged for record in listener.records)
+        assert name != "one" or counted == 1
 
 
 def test_bad_folders(tmp_path: Path):

@@ -20,19 +20,16 @@ DONE = Summary(4, 8, 1.0, 0.0, None, 0, None)
 Points = dict[str, list[tuple[int, float]]]  # name -> actions and value, in their order
 
 
-def _record(actions: int, success: float = 1.0) -> Record:
-    own = {"actions": actions, "outcomes": {"lifted": 3}, "grasp_success": success}
-    return Record(**BLANK | own | {"critic_loss": None})
-
-
 def _follow(tracker: trackers.Tracker, folder: Path, pause: float = 0.0) -> None:
     """Tracks a run that is stopped and, after a pause, s, resumed, with an evaluation."""
     folder.mkdir(parents=True)
     for step, success in ((0, 0.25), (4, 0.75)):
+        changed = {"actions": 8 + 2 * step, "grasp_success": success, "critic_loss": None}
+        record = Record(**BLANK | changed | {"outcomes": {"lifted": 3}})
         tracker.begin(RunInfo(CFG, folder, step))
-        tracker.chunk(_record(8 + 2 * step, success), None)
+        tracker.chunk(record, None)
         if step == 0:
-            tracker.evaluated(_record(8), TABLE)
+            tracker.evaluated(record, TABLE)
         tracker.end(DONE)
         time.sleep(pause)
 

@@ -95,23 +95,15 @@ def numbers(program: Program, key: jax.Array, step: jax.Array) -> jax.Array:
     key_noise, key_push = jax.random.split(key)
     share = step.astype(jnp.float32) / 10.0
     outcomes = jnp.arange(5, dtype=jnp.int32)
-    far, zero = jnp.float32(0.4), jnp.float32(0.0)
 
-    def reward(primitive: int, outcome: jax.Array, distance: jax.Array, gain: jax.Array, lost: int):
-        result = rewards.ActionResult(
-            primitive=jnp.int32(primitive),
-            outcome=outcome,
-            distance=distance,
-            phi_before=zero,
-            phi_after=gain,
-            changed=jnp.array(True),
-            blocks_lost=jnp.int32(lost),
-        )
+    def reward(primitive: int, outcome: Any, distance: Any, gain: float, lost: int) -> jax.Array:
+        numbers = jnp.int32(outcome), jnp.float32(distance), jnp.float32(0.0), jnp.float32(gain)
+        changed, lost = jnp.array(True), jnp.int32(lost)
+        result = rewards.ActionResult(jnp.int32(primitive), *numbers, changed, lost)
         return rewards.reward(cfg.reward, result)
 
-    grasps = jax.vmap(lambda outcome: reward(1, outcome, far, zero, 1))(outcomes)
-    gains = (jnp.float32(0.05), jnp.float32(0.5))
-    pushes = [reward(0, jnp.int32(0), zero, gain, 0) for gain in gains]
+    grasps = jax.vmap(lambda outcome: reward(1, outcome, 0.4, 0.0, 1))(outcomes)
+    pushes = [reward(0, 0, 0.0, gain, 0) for gain in (0.05, 0.5)]
     ex = cfg.explore
     chances = [
         explore.probability(start, end, ex.epsilon_decay, 100 * step)
