@@ -495,7 +495,6 @@ class Config(Section):
 
 
 def _changed(section: Any, value: Any) -> Any:
-    """Returns a section with the fields of a dict, or `value` itself if it is none."""
     if not isinstance(value, dict) or not isinstance(section, Section):
         return value
     tag, _ = ALTERNATIVES.get(section.SECTION, ("", ()))

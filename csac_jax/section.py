@@ -58,7 +58,6 @@ def _is_plain(value: Any) -> bool:
 
 
 def _fault(field: Any, value: Any) -> str | None:
-    """Returns what is wrong with a value of a field, or with an item of one."""
     kind = typing.get_args(field.type)[0] if typing.get_origin(field.type) is tuple else field.type
     choices = typing.get_args(kind)
     if typing.get_origin(kind) is Literal and value not in choices:

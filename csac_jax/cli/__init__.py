@@ -92,7 +92,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _logged() -> Iterator[None]:
-    """Prints the package's log of long work to stderr."""
     logger, handler = logging.getLogger(csac_jax.__name__), logging.StreamHandler()
     level, propagate = logger.level, logger.propagate
     logger.addHandler(handler)
@@ -154,7 +153,6 @@ def _dispatch(arguments: list[str]) -> int:
 
 
 def _on_device(arguments: list[str]) -> list[str]:
-    """Selects the device that --device names; returns the other arguments."""
     device, rest = parsing.take(arguments, "--device")
     if device is None:
         return arguments

@@ -70,7 +70,6 @@ def _read(arguments: list[str]) -> tuple[DoctorOptions | train.TrainOptions, Con
 
 
 def _build_kernels(cfg: Config) -> dict[str, Any]:
-    """Builds Warp's kernels for such a run; returns the seconds for the JSON."""
     from csac_jax.sim import physics
     from csac_jax.world import model
 
@@ -82,7 +81,6 @@ def _build_kernels(cfg: Config) -> dict[str, Any]:
 
 
 def _print_memory(cfg: Config) -> dict[str, Any]:
-    """Prints the memory of a run's state; returns it for the JSON."""
     from csac_jax.training import memory
 
     parts, available = memory.state_bytes(cfg), memory.limit()
@@ -115,7 +113,6 @@ def _print_machine() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _watchdog(seconds: float, message: str) -> Iterator[None]:
-    """Ends the process with `message` if the block takes longer than `seconds`."""
     timer = threading.Timer(seconds, lambda: os._exit(complain(1, message)))
     timer.start()
     try:

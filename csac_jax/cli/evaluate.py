@@ -24,33 +24,25 @@ TABLE = "table.md"  # in the folder --out
 
 @dataclasses.dataclass(frozen=True)
 class EvalOptions:
-    """Measures a policy in scenes that training never saw. It sees as it was trained to, and
-    has the same gripper, unless other settings are given."""
+    """Measures a policy in scenes that training never saw, with its own view and gripper."""
 
     source: tyro.conf.Positional[str]
-    """A run's folder, a policy file, or one that comes with the package, such as shipped; or a
-    sweep's folder: all its final policies, each result in the folder of its run."""
+    """A run, a policy file, or a shipped policy; or a sweep: all its final policies."""
     which: str = "last"
-    """Checkpoint of the run: last, the newest sound one; best, of a run trained with --eval-every;
-    or a step."""
+    """Checkpoint of the run: last, best (of a run trained with --eval-every), or a step."""
     policy: str = "learned"
-    """What acts: learned, the networks; random, grasps at random places above blocks; geometric,
-    antipodal grasps from the edges of the height map; oracle, a planner that reads the blocks'
-    poses; or MODULE:NAME, your own, made from the config of the source."""
+    """Actor: learned, the networks; random, above blocks; geometric, antipodal grasps from the
+    height map; oracle, a planner that reads the blocks' poses; or MODULE:NAME, your own."""
     suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
-    """Scenes: in_distribution (like the training's), random10, random30, cases, target (needs a
-    policy of that task), packed, camera (random10 through ever worse cameras), pile,
-    objects_packed, objects10, target_objects (objects of a library), or case files; all for every
-    suite that fits the policy."""
+    """Scenes: in_distribution (like the training's), random10, random30, cases, packed, camera
+    (ever worse ones), target (of that task); pile, objects_packed, objects10, target_objects (of a
+    library); case files; or all that fit the policy."""
     out: Path | None = None
-    """Folder for a file of each suite and a table of all. Suites that it holds already are not
-    measured again."""
+    """Folder for a file of each suite and a table of all; finished suites are not repeated."""
     jobs: int = 0
-    """With --out, suites at a time, each on a core of its own; 0 for one per core. One at a time
-    has all cores, or the GPU."""
+    """With --out, suites at a time, one a core; 0: as many as cores. 1 has all, or the GPU."""
     objects: str | None = None
-    """Library that suites of objects draw from: a folder, or procedural:SEED:COUNT; by default the
-    policy's."""
+    """Library of suites of objects, or procedural:SEED:COUNT; by default the policy's."""
     split: Literal["held_out", "train", "all"] = "held_out"
     """Which of its objects."""
     physics: Literal["auto", "mjx", "c"] = "auto"
@@ -109,7 +101,6 @@ def _check(options: EvalOptions) -> None:
 
 
 def _which(text: str) -> Any:
-    """Reads `best`, `last`, or the number of a step."""
     if text in ("best", "last"):
         return text
     if not text.isdecimal():
@@ -118,7 +109,6 @@ def _which(text: str) -> Any:
 
 
 def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
-    """Measures the final policies of a sweep that are left; returns the exit code."""
     fields = dataclasses.fields(EvalOptions)
     changed = {field.name for field in fields if getattr(options, field.name) != field.default}
     if changed - {"source", "suites", "episodes"} or any(view.values()):
@@ -133,7 +123,6 @@ def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
 
 
 def _policy(options: EvalOptions, changes: dict[str, Any]) -> tuple[Any, Any]:
-    """Makes the policy; returns it and the config that it acts in."""
     from csac_jax.evaluation import policies
 
     policy = policies.make(options.policy, options.source, _which(options.which))
@@ -175,7 +164,6 @@ def _measure(
 
 
 def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> int:
-    """Measures what the folder lacks, suite by suite; returns the exit code."""
     from csac_jax.evaluation import suites
 
     if out.exists() and not out.is_dir():
@@ -207,7 +195,6 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 
 
 def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
-    """Returns the suites that a policy of this config can act in."""
     from csac_jax.evaluation import suites
 
     targets = {cfg.task.kind == "target"} if options.policy == "learned" else {False, True}
@@ -227,7 +214,6 @@ def _episodes(options: EvalOptions, suite: str) -> int:
 
 
 def _digest(options: EvalOptions, policy: Any, cfg: Any) -> str:
-    """Returns a digest of all that a result follows from: networks, settings and options."""
     import jax
     import numpy as np
 
@@ -242,7 +228,6 @@ def _digest(options: EvalOptions, policy: Any, cfg: Any) -> str:
 
 
 def _is_kept(path: Path, episodes: int, tag: str) -> bool:
-    """Tells if a file holds the whole result that is asked for."""
     try:
         result = files.read_object(path)
     except (FileNotFoundError, ValueError):
@@ -251,7 +236,6 @@ def _is_kept(path: Path, episodes: int, tag: str) -> bool:
 
 
 def _write_table(folder: Path, paths: dict[str, Path]) -> str:
-    """Writes and returns the table of the suites that are measured."""
     from csac_jax.report import suite_table
 
     results = [files.read_object(path) for path in paths.values() if path.exists()]
@@ -261,7 +245,6 @@ def _write_table(folder: Path, paths: dict[str, Path]) -> str:
 
 
 def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
-    """Returns a function that shows a suite's progress on a terminal."""
     lines: dict[str, Any] = collections.defaultdict(lambda: bars.add_task(""))
 
     def show(suite: str, part: str, finished: int, total: int) -> None:

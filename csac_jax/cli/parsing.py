@@ -68,7 +68,6 @@ def _message(event: Any, kind: Any) -> str | None:
 
 
 def _flags(kind: Any, prefix: str = "--") -> list[str]:
-    """Returns the flags of a dataclass and of its sections."""
     flags: list[str] = []
     for field in dataclasses.fields(kind):
         name = prefix + field.name.replace("_", "-")
@@ -79,7 +78,6 @@ def _flags(kind: Any, prefix: str = "--") -> list[str]:
 
 @contextlib.contextmanager
 def _registry() -> Iterator[None]:
-    """Adds to tyro that a gripper is given by its name or folder."""
     registry = tyro.constructors.ConstructorRegistry()
 
     @registry.primitive_rule

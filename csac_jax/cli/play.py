@@ -16,18 +16,16 @@ from csac_jax.render import gl
 
 @dataclasses.dataclass(frozen=True)
 class PlayOptions:
-    """Runs one episode and prints the effect of every action. Draws it if asked to."""
+    """Runs one episode and prints the effect of every action."""
 
     scene: str = "random"
-    """Scene: random (dropped blocks), a shipped case by name, a case file, or objects of a library:
-    pile, objects_packed, objects10."""
+    """Dropped blocks (random), a shipped case, a case file; pile, objects_packed or objects10."""
     objects: str | None = None
-    """Library of those objects: a folder, or procedural:SEED:COUNT for procedural shapes."""
+    """Library of objects for the last three: a folder, or procedural:SEED:COUNT."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
-    """Policy: oracle (reads the blocks' poses), random (a random place above a block), one that
-    comes with the package, such as shipped, the folder of a run or a policy file."""
+    """Policy: oracle (reads the blocks' poses), random, a shipped one, a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
@@ -37,11 +35,9 @@ class PlayOptions:
     size: tuple[int, int] = (640, 480)
     """Width and height of picture and video, px, even numbers."""
     views: bool = True
-    """Show height map and action next to the scene; of a learned policy also Q of both primitives,
-    best over yaws, and the candidates of its search."""
+    """Show height map, action and, of a learned policy, Q and the candidates of its search."""
     viewer: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Show the episode in 3-D: in MuJoCo's window where there is a display, else as a page for the
-    browser (extra `viewer`)."""
+    """Show it in 3-D: in a window, or without a display in the browser (extra `viewer`)."""
     seed: int = 0
     """Seed of the scene and of the policy's noise."""
     json: Path | None = None

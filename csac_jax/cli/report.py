@@ -17,11 +17,9 @@ class ReportOptions:
     """Tables of recorded runs and evaluations over their seeds; needs no JAX."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs or of folders of runs, archives of them (.tar.xz), and files that `eval
-    --json` wrote. Archives that lie directly in a folder are read, too."""
+    """Folders of runs, archives of them (.tar.xz), folders of these, and files of `eval --json`."""
     out: Path | None = None
-    """Folder to write a page to, index.html, with curves and the pictures and videos that lie in
-    the folders; needs the extra `report`."""
+    """Folder to write a page to, with curves, pictures and videos; needs the extra `report`."""
     markdown: Path | None = None
     """File to write the tables to, as a page of documentation."""
     json: Path | None = None

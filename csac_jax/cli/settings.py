@@ -83,7 +83,6 @@ def parse(
 
 
 def _with_sections(options: type, kinds: dict[str, Any]) -> Any:
-    """Returns a dataclass of a command's options and of sections of settings."""
     fields = [(name, kind, dataclasses.field(default=kind())) for name, kind in kinds.items()]
     kind: Any = dataclasses.make_dataclass(
         options.__name__, fields, bases=(options,), frozen=True, kw_only=True
@@ -123,7 +122,6 @@ def _description(options: type, command: str, examples: Sequence[str]) -> str:
 
 
 def _shortened(section: Any, some: Collection[str]) -> Any:
-    """Returns some settings of a section, as an instance of a smaller dataclass."""
     return _some(type(section), some)(**{name: getattr(section, name) for name in some})
 
 

@@ -34,11 +34,10 @@ class SweepOptions:
     """Seeds of every setting: --seed, --seed + 1, ..."""
     vary: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """NAME=A,B,...: a setting, algo, task (clear, target, packed) or switch (none, sensed,
-    anywhere, oblique, noisy, ur5, together), and its values; once per setting, every combination
-    is run. Colons separate a tuple's items: replay.end=1:4,1:12."""
+    anywhere, oblique, noisy, ur5, together), and its values. Every combination is run. Colons
+    separate a tuple's items: replay.end=1:4,1:12."""
     evaluate: int = 0
-    """Episodes to evaluate every final policy in; then a table, study.md, and a figure, study.png,
-    are written to the sweep's folder."""
+    """Episodes to evaluate every final policy in, for the sweep's study.md and study.png."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
@@ -90,7 +89,6 @@ def run(arguments: list[str]) -> int:
 
 
 def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) -> None:
-    """Prints grasp success of every setting, and writes the result."""
     from csac_jax.evaluation.statistics import Band
     from csac_jax.report import result_tables
 
@@ -105,7 +103,6 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
 
 
 def _write_study(folder: Path) -> None:
-    """Writes one table and one figure of the evaluated policies."""
     from csac_jax.report import comparison, figures, result_tables, results, study
 
     report = comparison.build(results.read([folder]))
@@ -142,7 +139,6 @@ def _parse(preset: str | None, flags: list[str]) -> tuple[SweepOptions, Config]:
 
 
 def _join(options: SweepOptions) -> None:
-    """Joins the other processes, if there are several."""
     place = (options.coordinator, options.processes, options.process_id)
     if not options.cluster and place == (None, None, None):
         return

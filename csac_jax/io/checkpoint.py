@@ -211,7 +211,6 @@ def _set_aside(folder: Path) -> None:
 
 
 def _publish(draft: Path, folder: Path) -> None:
-    """Gives a complete step its name and drops those before the last two."""
     if folder.exists():
         _set_aside(folder)  # not removed: a kill may come before the next line runs
     draft.rename(folder)
@@ -241,7 +240,6 @@ def _name_run(root: Path) -> str:
 
 
 def _run_name(root: Path) -> str | None:
-    """Returns the run's name, None if it is missing or damaged."""
     if not (root / _RUN).is_file():
         return None
     name, _, digest = (root / _RUN).read_bytes().partition(b" ")
@@ -288,7 +286,6 @@ def _read(folder: Path, **items: Any) -> Any:
 
 
 def _steps(run_dir: Path) -> list[int]:
-    """Returns the saved steps, the oldest first."""
     names = [path.name for path in _root(run_dir).glob("*")]
     return sorted(int(name) for name in names if re.fullmatch("0|[1-9][0-9]{0,17}", name))
 
@@ -315,7 +312,6 @@ def _typed(array: Any, leaf: Any) -> Any:
 
 
 def _record(folder: Path) -> dict[str, Any]:
-    """Reads the record of a step. Raises OSError, and ValueError for other content."""
     record = files.read_object(folder / "extra" / "metadata")
     if not all(isinstance(record.get(name), dict) for name in ("layout", "extra")):
         raise ValueError("it is no checkpoint of csac_jax")
@@ -328,7 +324,6 @@ def _own_step(arrays: dict[str, Any]) -> int | None:
 
 
 def _digests(folder: Path) -> dict[str, str]:
-    """Returns the SHA-256 of each file of a step but the manifest."""
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.name != MANIFEST]
     return {path.relative_to(folder).as_posix(): _sha256(path) for path in paths}
 
@@ -339,7 +334,6 @@ def _sha256(path: Path) -> str:
 
 
 def _fault(folder: Path) -> str | None:
-    """Returns the fault of the files of a step, None if they are sound."""
     try:
         wanted = files.read_object(folder / MANIFEST)
         actual = _digests(folder)

@@ -66,7 +66,6 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _validated(name: str, stored: Any) -> Any:
-    """Checks and builds a section, or a setting outside them."""
     if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
         sim = _validated(name, stored | {"gripper": SimConfig.gripper})
         return dataclasses.replace(sim, gripper=_own_gripper(stored["gripper"]))
@@ -88,7 +87,6 @@ def _validated(name: str, stored: Any) -> Any:
 
 
 def _kind(name: str, stored: Any) -> Any:
-    """Returns the type of a section, of the alternative that is stored, or of another setting."""
     if name not in names(Config):
         raise SettingsError(f"{name}: unknown setting")
     tag, _ = config.ALTERNATIVES.get(name, ("", ()))
@@ -141,7 +139,6 @@ def _configured(values: dict[str, Any], preset: str | None, algo: str | None) ->
 
 
 def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
-    """Returns the values of a whole config: `base` with those of a file."""
     whole = to_dict(base)
     for name, value in values.items():
         section = getattr(base, name, None)

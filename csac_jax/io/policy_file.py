@@ -61,7 +61,6 @@ def check_finite(source: Any, params: Any) -> None:
 
 
 def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
-    """Returns the SHA-256 of a policy without its digest."""
     content = hashlib.sha256()
     for name in sorted(remarks.keys() - {_DIGEST}):
         content.update(f"{name}={remarks[name]}\n".encode())
@@ -111,7 +110,6 @@ def load(path: Path) -> tuple[Config, Params]:
 
 
 def _content(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
-    """Returns remarks and tensors of a policy's file."""
     try:
         with safetensors.safe_open(path, "numpy") as file:
             remarks = file.metadata() or {}
@@ -127,7 +125,6 @@ def _content(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
 
 
 def _config(path: Path, remarks: dict[str, str]) -> tuple[Config, Any]:
-    """Returns the config and the versions of the libraries that made the file."""
     try:
         cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
         if _GRIPPER in remarks:
@@ -141,7 +138,6 @@ def _config(path: Path, remarks: dict[str, str]) -> tuple[Config, Any]:
 
 
 def _params(path: Path, cfg: Config, tensors: dict[str, np.ndarray]) -> Params:
-    """Returns the networks of a config from tensors by name."""
     try:
         blank = actor_critic.abstract_params(cfg)
     except Exception as error:  # sizes that no network can have

@@ -25,7 +25,6 @@ BEGIN, END = "<!-- faults: begin -->", "<!-- faults: end -->"
 
 
 def main(names: list[str]) -> int:
-    """Runs them one after the other; returns the exit code."""
     faults = harness.load()
     chosen = [one for one in faults.values() if not names or any(n in one.name for n in names)]
     tallies: list[tuple[str, harness.Tally]] = []
@@ -50,7 +49,6 @@ def main(names: list[str]) -> int:
 
 
 def with_table(page: str, text: str) -> str:
-    """Returns a page with `text` between its markers."""
     pattern = f"{re.escape(BEGIN)}.*{re.escape(END)}"
     new, number = re.subn(pattern, lambda _: f"{BEGIN}\n{text}{END}", page, flags=re.DOTALL)
     if number != 1:

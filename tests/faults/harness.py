@@ -35,7 +35,6 @@ class Tally:
     remarks: list[str] = dataclasses.field(default_factory=list)  # of each try that went wrong
 
     def each(self, items: Iterable[Any]) -> Iterator[Any]:
-        """Yields the items, each of which is a try."""
         for item in items:
             self.tries += 1
             yield item
@@ -52,7 +51,6 @@ class Tally:
 
     @property
     def bad(self) -> int:
-        """Returns the number of tries that went wrong."""
         return self.lost + self.silent + self.tracebacks + self.hangs
 
 
@@ -61,8 +59,6 @@ Inject = Callable[[Tally, np.random.Generator, int, Path], None]
 
 @dataclasses.dataclass(frozen=True)
 class Fault:
-    """A kind of fault."""
-
     name: str
     tries: int  # of the whole suite
     inject: Inject
@@ -77,7 +73,6 @@ class MissingToolError(Exception):
 
 
 def load() -> dict[str, Fault]:
-    """Returns all faults, by name."""
     for name in MODULES:
         importlib.import_module(f"tests.faults.{name}")
     return FAULTS
@@ -102,15 +97,12 @@ def fault(name: str, tries: int, slow: bool = False) -> Callable[[Inject], Injec
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """The end of a process."""
-
     code: int | None  # None where it hung
     output: str
     errors: str
 
 
 def start(arguments: Sequence[str], prefix: Sequence[str] = ()) -> subprocess.Popen[str]:
-    """Starts `python ARGUMENTS` in the repository; `prefix` is a program that starts Python."""
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     quiet = {"JAX_PLATFORMS": "cpu", "JAX_ENABLE_COMPILATION_CACHE": "0", "PYTHONPATH": path}
     return subprocess.Popen(
@@ -125,7 +117,6 @@ def start(arguments: Sequence[str], prefix: Sequence[str] = ()) -> subprocess.Po
 
 
 def wait(process: subprocess.Popen[str], limit: float) -> Answer:
-    """Returns the end of a process; kills it after `limit` s."""
     try:
         output, errors = process.communicate(timeout=limit)
         return Answer(process.returncode, output, errors)
@@ -135,7 +126,6 @@ def wait(process: subprocess.Popen[str], limit: float) -> Answer:
 
 
 def judge(tally: Tally, answer: Answer, about: str) -> None:
-    """Counts an answer that hung or has a traceback."""
     tally.check(answer.code is not None, "hangs", f"{about}: hung")
     broken = "Traceback (most recent call last)" in answer.errors
     tally.check(not broken, "tracebacks", f"{about}: {answer.errors.strip().splitlines()[-1:]}")
@@ -189,7 +179,6 @@ def damage(rng: np.random.Generator, kind: str, path: Path) -> str:
 
 
 def table(tallies: Iterable[tuple[str, Tally]]) -> str:
-    """Returns the results as a Markdown table."""
     lines = [
         "| fault | tries | lost | silent | tracebacks | hangs |",
         "|---|---:|---:|---:|---:|---:|",

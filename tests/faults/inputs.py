@@ -52,7 +52,6 @@ class _RefusedError(Exception):
 def _judge(
     tally: Tally, about: str, read: Callable[[], Any], expected: type[Exception] | tuple = ()
 ) -> None:
-    """Counts a call that neither raises `expected` in one line nor says that all is sound."""
     kinds = (*expected, _SoundError) if isinstance(expected, tuple) else (expected, _SoundError)
 
     def call() -> None:
@@ -69,7 +68,6 @@ def _judge(
 
 
 def _damaged(prepare: Prepare, kind: str, tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Damages a file again and again. It must be refused, or read as before."""
     path, read, expected = prepare(folder)
     whole, right = path.read_bytes(), read()
 
@@ -83,7 +81,6 @@ def _damaged(prepare: Prepare, kind: str, tally: Tally, rng: Rng, tries: int, fo
 
 
 def _params(number: int) -> Any:
-    """Draws networks of CFG."""
     rng = np.random.default_rng(number)
     blank = actor_critic.abstract_params(CFG)
     return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
@@ -126,7 +123,6 @@ def _pool(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
 
 
 def _cache(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
-    """Writes an entry of the cache of compiled programs, packed as by this package."""
     path = folder / "entry-cache"
     program = jax.jit(lambda x: jnp.tanh(x) @ jnp.sort(x).T).lower(jnp.ones((8, 8))).compile()
     whole = program.runtime_executable().serialize()
@@ -184,7 +180,6 @@ def _line(number: int) -> str:
 
 
 def _fault_of_log(path: Path, written: list[bytes]) -> str | None:
-    """Cuts a log to its steps; returns a fault in the result."""
     before = path.read_bytes()
     *whole, _ = before.split(b"\n")
     with warnings.catch_warnings(record=True) as damage:
@@ -224,7 +219,6 @@ def _numbers(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 
 def _places(content: Any, depth: int = 8) -> Iterator[tuple[Any, Any]]:
-    """Yields every container of JSON content, to a depth, with each of its keys."""
     for key in list(content) if isinstance(content, dict) else range(len(content)):
         yield content, key
         if isinstance(content[key], dict | list) and depth:
@@ -252,9 +246,13 @@ def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
         name = names[int(rng.integers(len(names)))]
         return safetensors.numpy.save(tensors | {name: others[name]}, remarks)
 
-    def header(text: str) -> bytes:
-        return len(text.encode()).to_bytes(8, "little") + text.encode() + bytes(64)
+    def header(text: str) -> Callable[[], bytes]:
+        return lambda: len(text.encode()).to_bytes(8, "little") + text.encode() + bytes(64)
 
+    def tensor(kind: str, size: int, start: int = 0) -> str:
+        return f'{{"dtype":"{kind}","shape":[{size}],"data_offsets":[{start},{start + size}]}}'
+
+    spaced = remarks | {"config": remarks["config"][:-1] + " }"}
     contents: dict[str, Callable[[], bytes]] = {
         "nothing": bytes,
         "one byte": lambda: b"\0",
@@ -265,43 +263,19 @@ def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
         "no remarks": lambda: safetensors.numpy.save(others),
         "a tensor of another": swapped,
         "the config of another": lambda: safetensors.numpy.save(
-            safetensors.numpy.load(own), remarks | {"config": remarks["config"][:-1] + " }"}
+            safetensors.numpy.load(own), spaced
         ),
         "a huge header": lambda: (2**62).to_bytes(8, "little") + junk,
-        "a deep header": lambda: header("[" * 100_000),
-        "an F8 tensor": lambda: header(
-            '{"a":{"dtype":"F8_E4M3","shape":[64],"data_offsets":[0,64]}}'
-        ),
-        "an unknown tensor": lambda: header(
-            '{"a":{"dtype":"F8","shape":[64],"data_offsets":[0,64]}}'
-        ),
-        "tensors one over the other": lambda: header(
-            '{"a":{"dtype":"I8","shape":[64],"data_offsets":[0,64]},'
-            '"b":{"dtype":"I8","shape":[32],"data_offsets":[16,48]}}'
-        ),
+        "a deep header": header("[" * 100_000),
+        "an F8 tensor": header(f'{{"a":{tensor("F8_E4M3", 64)}}}'),
+        "an unknown tensor": header(f'{{"a":{tensor("F8", 64)}}}'),
+        "one over the other": header(f'{{"a":{tensor("I8", 64)},"b":{tensor("I8", 32, 16)}}}'),
     }
     kinds = list(contents)
     for number in tally.each(range(tries)):
         kind = kinds[number % len(kinds)]
         path.write_bytes(contents[kind]())
         _judge(tally, kind, read, expected)
-
-
-@fault("numbers that are not finite in policy files", 60)
-def _not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Writes and reads networks that are not finite, with a right digest: both are refused."""
-    path, read, expected = _policy(folder)
-    for number in tally.each(range(tries)):
-        params = _params(number)
-        each = jax.tree.leaves(params)
-        leaf = each[int(rng.integers(len(each)))]
-        leaf.flat[int(rng.integers(leaf.size))] = (np.nan, np.inf, -np.inf)[number % 3]
-        if number % 2:
-            with mock.patch.object(policy_file, "check_finite"):
-                policy_file.save(path, params, CFG)
-            _judge(tally, "read", read, expected)
-        else:
-            _judge(tally, "written", lambda p=params: policy_file.save(path, p, CFG), expected)
 
 
 # Hostile content: valid files with values that nobody would write.
@@ -350,7 +324,6 @@ def _hostile(valid: Any) -> st.SearchStrategy[Any]:
 
 
 def _texts(valid: Any) -> st.SearchStrategy[bytes]:
-    """Draws files of such content; now and then no JSON at all, or too deep for any reader."""
     written = _hostile(valid).map(lambda content: json.dumps(content).encode())
     broken = st.binary(max_size=40) | st.sampled_from(
         [b"[" * 10**5, b'{"a":' * 10**5, b"\xff", b""]
@@ -358,97 +331,85 @@ def _texts(valid: Any) -> st.SearchStrategy[bytes]:
     return st.one_of(*[written] * 9, broken)
 
 
-def _each(
-    tally: Tally, rng: Rng, tries: int, texts: st.SearchStrategy[bytes], path: Path
-) -> Iterator[bytes]:
-    """Writes `tries` drawn files at `path`, one after the other, each a try."""
+def _read_all(
+    tally: Tally,
+    rng: Rng,
+    tries: int,
+    path: Path,
+    valid: Any,
+    sound: Callable[[], bool],
+    expected: type[Exception] | tuple,
+) -> None:
+    """Writes hostile files at `path`. Each must be refused, or be `sound`."""
     drawn: list[bytes] = []
-    quiet = settings(
-        max_examples=tries,
-        database=None,
-        deadline=None,
-        phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )
+    options: dict[str, Any] = {"database": None, "deadline": None, "phases": [Phase.generate]}
+    quiet = settings(max_examples=tries, suppress_health_check=list(HealthCheck), **options)
+    quiet(seed(int(rng.integers(2**31)))(given(_texts(valid))(lambda text: drawn.append(text))))()
 
-    quiet(seed(int(rng.integers(2**31)))(given(texts)(lambda text: drawn.append(text))))()
+    def read() -> None:
+        if sound():
+            raise _SoundError
+
     for text in tally.each(drawn):
         path.write_bytes(text)
-        yield text
-
-
-def _say(text: bytes) -> str:
-    return repr(text if len(text) <= 300 else text[:140] + b" ... " + text[-140:])
+        shown = repr(text if len(text) <= 300 else text[:140] + b" ... " + text[-140:])
+        _judge(tally, f"{path.name} {shown}", read, expected)
 
 
 @fault("hostile config files", 500)
 def _configs(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Reads hostile configs: refused, or they come back as they were written."""
     path = folder / files.CONFIG
-    texts = _texts(configs.to_dict(CFG))
 
-    def read() -> None:
+    def sound() -> bool:
         cfg = configs.from_dict(files.read_object(path))
-        if configs.from_dict(json.loads(json.dumps(configs.to_dict(cfg)))) == cfg:
-            raise _SoundError
+        return configs.from_dict(_copied(configs.to_dict(cfg))) == cfg
 
-    for text in _each(tally, rng, tries, texts, path):
-        _judge(tally, _say(text), read, ValueError)
+    _read_all(tally, rng, tries, path, configs.to_dict(CFG), sound, ValueError)
 
 
 @fault("hostile case files", 500)
 def _cases(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Reads hostile cases: refused, or they lie in the workspace."""
-    path = folder / "case.json"
+    path, reach = folder / "case.json", 0.5 * CFG.heightmap.extent
     valid = json.loads(cases.shipped(cases.names()[0]).read_text())
-    reach = 0.5 * CFG.heightmap.extent
 
-    def read() -> None:
-        scene = cases.load(path).scene
-        if np.isfinite(scene.position).all() and np.abs(scene.position[:, :2]).max() <= reach:
-            raise _SoundError
+    def sound() -> bool:
+        places = cases.load(path).scene.position
+        return np.isfinite(places).all() and np.abs(places[:, :2]).max() <= reach
 
-    for text in _each(tally, rng, tries, _texts(valid), path):
-        _judge(tally, _say(text), read, ValueError)
+    _read_all(tally, rng, tries, path, valid, sound, ValueError)
 
 
 @fault("hostile sweep.json", 300)
 def _plans(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Reads hostile plans: refused, or all runs lie in the sweep's folder, each in its own."""
-    path = folder / files.SWEEP_PLAN
     valid = json.loads(runner.plan_text(_plan()))
     del valid[runner.DIGEST]
 
-    def read() -> None:
-        plan = runner.read_plan(folder)
-        places = [(folder / run).resolve() for run in runner.runs_of(plan)]
-        if len(set(places)) == len(places) and all(
-            folder.resolve() in one.parents for one in places
-        ):
-            raise _SoundError
+    def sound() -> bool:
+        runs = runner.runs_of(runner.read_plan(folder))
+        places = {(folder / run).resolve() for run in runs}
+        inside = all(folder.resolve() in place.parents for place in places)
+        return len(places) == len(runs) and inside
 
-    for text in _each(tally, rng, tries, _texts(valid), path):
-        _judge(tally, _say(text), read, (SweepError, OSError))
+    path = folder / files.SWEEP_PLAN
+    _read_all(tally, rng, tries, path, valid, sound, (SweepError, OSError))
 
 
 @fault("hostile manifests", 200)
 def _manifests(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Reads hostile manifests: the step is skipped for the one before."""
-    state = {"step": jnp.int32(4)}
     for step in (4, 8):
         checkpoint.save(folder, step, {"step": jnp.int32(step)}, CFG, {})
     path = folder / checkpoint.FOLDER / "8" / checkpoint.MANIFEST
     valid = json.loads(path.read_text())
 
-    def read() -> None:
-        found = checkpoint.sound(folder).name
-        if found == "4" or (found == "8" and json.loads(path.read_text()) == valid):
-            raise _SoundError
+    def sound() -> bool:
+        name = checkpoint.sound(folder).name
+        return name == "4" or (name == "8" and json.loads(path.read_text()) == valid)
 
-    for text in _each(tally, rng, tries, _texts(valid), path):
-        _judge(tally, _say(text), read, CheckpointError)
-    path.write_text(json.dumps(valid))
-    assert int(checkpoint.restore(folder, jax.eval_shape(lambda: state))[0]["step"]) == 8
+    _read_all(tally, rng, tries, path, valid, sound, CheckpointError)
 
 
 @fault("hostile records of runs and evaluations", 300)
@@ -461,22 +422,18 @@ def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     evaluation = {"policy": "learned", "suite": "cases", "seed": 5, "config": config}
     evaluation |= {"parts": {"a": part, "b": part}, "versions": {"jax": "1"}, "commit": "abc"}
     record = {"wall_seconds": 3.0, "config": config, "device": "cpu", "versions": {"jax": "1"}}
-    valid = {
-        "eval.json": evaluation,
-        files.CONFIG: config,
-        results.RECORD: record,
-        files.METRICS: json.loads(_line(3)),
-    }
-    for number, (name, content) in enumerate(valid.items()):
-        own = folder / str(number)
+    valid = {"eval.json": evaluation, files.CONFIG: config, results.RECORD: record}
+    valid[files.METRICS] = json.loads(_line(3))
+    for name, content in valid.items():
+        own = folder / name
         for other in valid:
             files.replace(own / other, json.dumps(valid[other]) + "\n")
 
-        def read(own: Path = own) -> None:
+        def sound(own: Path = own) -> bool:
             report = comparison.build(results.read([own]))
-            result_tables.markdown(report)
-            json.dumps(result_tables.as_json(report))
-            raise _SoundError
+            return bool(
+                result_tables.markdown(report) and json.dumps(result_tables.as_json(report))
+            )
 
-        for text in _each(tally, rng, -(-tries // len(valid)), _texts(content), own / name):
-            _judge(tally, f"{name} {_say(text)}", read, (ValueError, FailedError))
+        few = -(-tries // len(valid))
+        _read_all(tally, rng, few, own / name, content, sound, (ValueError, FailedError))

@@ -12,7 +12,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from unittest import mock
 
 import jax
@@ -24,8 +23,7 @@ from csac_jax.errors import DataWarning
 from csac_jax.io import checkpoint, files
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, programs, step, transitions
-from csac_jax.training.loop import TrainingError
+from csac_jax.training import loop, programs, step
 from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault
 
@@ -42,7 +40,6 @@ class _Run:
         self._reference = toy.Reference()
 
     def child(self, saves: int | None = None, wait: float = 0.0, **more: object) -> toy.Child:
-        """Starts a process that continues; listens until so many saves, then `wait` s more."""
         begun = checkpoint.latest_step(self.folder) is not None
         if not begun:  # killed before its first save: there is nothing to lose
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -54,14 +51,12 @@ class _Run:
         return child
 
     def judge(self, child: toy.Child, about: str, refused: bool = False, kill: bool = False):
-        """Counts the result of a process that has ended, which may have refused or was killed."""
         self.saved = max(self.saved, child.saved)
         self.tally.sound(child.problem(refused, kill), "tracebacks", about)
         found = toy.fault_of(self.folder, self._reference, self.saved)
         self.tally.sound(found, "lost", about)
 
     def judge_full(self, child: toy.Child, ended: bool, about: str) -> None:
-        """Counts the result on a full disc: one line, and no drafts."""
         self.tally.check(ended, "hangs", f"{about}: hung")
         self.judge(child, about, refused=True)
         drafts = re.compile(r"\.tmp$|\.saving|orbax-checkpoint-tmp")
@@ -96,7 +91,6 @@ def sigterm(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 
 def _calls(folder: Path) -> list[tuple[str, int]]:
-    """Returns the system calls that write, of a chunk and its save: name, number in a thread."""
     log = folder / "calls"
     child = toy.Child(toy.Order(folder / "counted", steps=2, held=True))
     child.listen(WORK, saves=1)
@@ -114,7 +108,6 @@ def _calls(folder: Path) -> list[tuple[str, int]]:
 
 @contextlib.contextmanager
 def _strace(child: toy.Child, *arguments: str) -> Iterator[None]:
-    """Traces all threads of a process in the block."""
     if shutil.which("strace") is None:
         raise MissingToolError("strace is not installed")
     command = ["strace", "-f", "-p", str(child.process.pid), *arguments]
@@ -131,14 +124,12 @@ def _strace(child: toy.Child, *arguments: str) -> Iterator[None]:
 
 
 def _chosen(rng: Rng, items: list, tries: int) -> list:
-    """Returns all of them, in turn, or as many as there are tries, at random."""
     if tries >= len(items):
         return items
     return [items[i] for i in sorted(rng.choice(len(items), tries, replace=False))]
 
 
 def _injected(run: _Run, name: str, inject: str) -> tuple[toy.Child, bool]:
-    """Runs a process whose second save meets a fault of a system call; returns if it ended."""
     child = run.child(1, held=True, steps=2)
     with _strace(child, "-o", "/dev/null", "-e", f"trace={name}", "-e", f"inject={name}:{inject}"):
         child.go()
@@ -274,7 +265,6 @@ def swapped(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 
 def _put_names_right(tally: Tally, run_dir: Path, about: str) -> None:
-    """Follows the message that refuses steps with each other's names."""
     try:
         checkpoint.sound(run_dir)
         tally.check(False, "silent", f"{about}: taken")
@@ -284,14 +274,12 @@ def _put_names_right(tally: Tally, run_dir: Path, about: str) -> None:
 
 
 def _judge_resumed(tally: Tally, run_dir: Path, reference: toy.Reference, about: str) -> None:
-    """Counts a run that does not continue, or not to the right numbers."""
     resume = functools.partial(toy.train, run_dir, 2, resume=True)
     if (summary := harness.works(tally, f"{about}: resumed", resume)) is not None:
         tally.sound(toy.fault_of(run_dir, reference, summary.step), "lost", f"{about}: resumed")
 
 
 def _content(folder: Path) -> dict[str, bytes]:
-    """Returns every file of a folder."""
     paths = [path for path in folder.rglob("*") if path.is_file()]
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
@@ -309,21 +297,6 @@ def two_at_once(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
             first.go()
         first.kill()
         run.judge(first, about, kill=True)
-
-
-@fault("a loss or parameter that is not finite", tries=20)
-def not_finite(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Stops a training by NaN; the last good checkpoint stays the newest and is restored."""
-    reference = toy.Reference()
-    for number in tally.each(range(tries)):
-        run_dir, step = folder / str(number), int(rng.integers(1, 4))
-        kind = ("loss", "parameter")[number % 2]
-        about = f"{kind} of step {step}"
-        train = functools.partial(toy.train, run_dir, 6, bad=toy.Losses(**{kind: step}))
-        harness.refused(tally, about, train, TrainingError)
-        tally.sound(toy.fault_of(run_dir, reference, step), "lost", about)
-        newest = checkpoint.latest_step(run_dir)
-        tally.check(newest == step, "silent", f"{about}: step {newest} was saved")
 
 
 @fault("clock that goes backwards", tries=10)
@@ -362,9 +335,8 @@ def read_only(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
             closed = base if new else place
             mode = closed.stat().st_mode
             closed.chmod(0o555)
-            child = toy.Child(
-                toy.Order(place if new else base / "run", not new, steps=1, user=user)
-            )
+            run_dir = place if new else base / "run"
+            child = toy.Child(toy.Order(run_dir, not new, steps=1, user=user))
             ended, about = child.end(WORK), f"{place.name} is read-only"
             closed.chmod(mode)
             tally.check(ended, "hangs", f"{about}: hung")
@@ -399,11 +371,8 @@ def closed_pipe(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     reference, steps = toy.Reference(), 6
     ends = ["head", "true", ">/dev/full", ">&-", "2>&-", "2>/dev/full"]
     for number in tally.each(range(tries)):
-        end, run_dir, result = (
-            *(ends[number % len(ends)], folder / f"run {number}"),
-            folder / f"{number}.json",
-        )
-        about = f"stdout is {end}"
+        end, run_dir = ends[number % len(ends)], folder / f"run {number}"
+        result, about = folder / f"{number}.json", f"stdout is {end}"
         answer = _with_stdout(end, run_dir, result, steps)
         harness.judge(tally, answer, about)
         found = toy.fault_of(run_dir, reference, steps)
@@ -413,7 +382,6 @@ def closed_pipe(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 
 
 def _with_stdout(end: str, run_dir: Path, result: Path, steps: int) -> harness.Answer:
-    """Returns the command line's answer where its output ends so."""
     options = ["smoke", "--run-dir", str(run_dir), "--json", str(result), "--seed", "5"]
     options += ["--train.actions", str(steps * toy.E), *toy_cli.OPTIONS]
     shell = ["sh", "-c", f'exec "$@" {end}', "sh"] if ">" in end else []
@@ -427,46 +395,36 @@ def _with_stdout(end: str, run_dir: Path, result: Path, steps: int) -> harness.A
     return harness.wait(process, WORK)
 
 
-IMPORT_IN_THREAD = """
-import threading, warnings
-found = []
+PROGRAMS = {
+    "import in a thread": """
+import threading
+from pathlib import Path
 def work():
-    import csac_jax
     from tests.faults import toy
-    from pathlib import Path
-    found.append(toy.train(Path({run!r}), 2).step)
+    print([toy.train(Path({run!r}), 2).step])
 thread = threading.Thread(target=work)
 thread.start()
 thread.join()
-print(found)
-"""
-FORK_BEFORE = """
+""",
+    "fork before": """
 import os
-import csac_jax
 from pathlib import Path
 from tests.faults import toy
 if os.fork() == 0:
     toy.train(Path({run!r}), 2)
     os._exit(0)
 print([2] if os.wait()[1] == 0 else os.wait())
-"""
-FORK_AFTER = """
-import os, sys
-import csac_jax
+""",
+    "fork after": """
+import os
 from pathlib import Path
 from tests.faults import toy
-step = toy.train(Path({run!r}), 2).step
-sys.stdout.flush()
+print([toy.train(Path({run!r}), 2).step], flush=True)
 if os.fork() == 0:
     os._exit(0)
 assert os.wait()[1] == 0
 toy.train(Path({run!r}), 1, resume=True)
-print([step])
-"""
-PROGRAMS = {
-    "import in a thread": IMPORT_IN_THREAD,
-    "fork before": FORK_BEFORE,
-    "fork after": FORK_AFTER,
+""",
 }
 
 
@@ -492,7 +450,7 @@ VICTIMS = (
 
 @fault("names of sweeps that lead elsewhere", tries=len(VICTIMS))
 def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Resumes a sweep.json with such a name: refused, or it stays within its own folder."""
+    """Reads a sweep.json with such a name: it is refused, and nothing elsewhere changes."""
     for name in tally.each(_chosen(rng, list(VICTIMS), tries)):
         own = folder / str(tally.tries)
         victim, sweep = own / "victim", own / "sweep"
@@ -504,94 +462,50 @@ def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
         shown = name.format(root=own) if isinstance(name, str) else name
         point = SweepPoint(shown, {}, toy.config())  # type: ignore[arg-type]
         (sweep / "sweep.json").write_text(runner.plan_text(runner.SweepPlan(2, [point])))
-
-        def resume(sweep: Path = sweep) -> None:
-            plan = runner.read_plan(sweep)
-            reporter = toy.Quiet(stop_after=2)
-            runner.run(plan, sweep, _sweep_program, reporter, reporter.stop, resume=True)
-
-        harness.refused(tally, f"name {name!r}", resume, runner.SweepError)
+        read = functools.partial(runner.read_plan, sweep)
+        harness.refused(tally, f"name {name!r}", read, runner.SweepError)
         tally.check(_content(victim) == before, "lost", f"name {name!r}: the victim has changed")
 
 
-def _sweep_program(group: object) -> SimpleNamespace:
-    """Returns a stand-in for a `SweepProgram`, of two seeds."""
-
-    def init() -> toy.State:
-        states = [toy.first_state(seed) for seed in (5, 6)]
-        both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-        return both.replace(step=jnp.int32(0))
-
-    axes = toy.State(key=0, step=None, total=0, packed=0)  # type: ignore[arg-type]
-
-    def compile_chunk(num_steps: int) -> object:
-        one = toy.compile_chunk(num_steps)
-        return jax.jit(jax.vmap(one, in_axes=(axes,), out_axes=(axes, 1)))
-
-    def replica(state: toy.State, index: int) -> toy.State:
-        return toy.State(state.key[index], state.step, state.total[index], state.packed[index])
-
-    parts = {"init": init, "compile_chunk": compile_chunk, "replica": replica}
-    return SimpleNamespace(abstract=lambda: jax.eval_shape(init), **parts)
-
-
-@fault("NaN in one of 64 scenes, a reward, a gradient, a weight", tries=20, slow=True)
+@fault("NaN in a reward, a gradient or a weight", tries=20, slow=True)
 def nan_in_training(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Spoils the real step: a scene's NaN stays there, NaN in the networks is reported at once."""
+    """Spoils replay or learner of the real step: NaN in the networks is reported at once."""
     cfg = presets.smoke().change(
-        sim={"physics": "c"},
-        replay={"capacity": 128},
-        train={"scenes": 64, "learning_starts": 64, "actions": 6400},
+        sim={"physics": "c"}, replay={"capacity": 16}, train={"scenes": 8, "learning_starts": 8}
     )
     program = programs.make(cfg)
-    compiled = programs.compile_chunk(program, 1).lower(start := programs.init(program)).compile()
-
-    def run(state: step.TrainState) -> tuple[step.TrainState, transitions.StepMetrics]:
-        state, metrics = compiled(jax.tree.map(jnp.copy, state))
-        return state, jax.device_get(metrics)
-
-    start, _ = run(start)
+    start = programs.init(program)
+    compiled = programs.compile_chunk(program, 1).lower(start).compile()
+    start, _ = compiled(start)
     for number in tally.each(range(tries)):
-        kind = ("scene", "reward", "gradient", "weight")[number % 4]
-        state, told = start, None
+        kind = ("reward", "gradient", "weight")[number % 3]
+        state, problem = _poisoned(rng, jax.tree.map(jnp.copy, start), kind), None
         for _ in range(100 if kind == "reward" else 1):  # until it is drawn
-            state, metrics = run(_poisoned(rng, state, kind))
-            if told := loop.not_finite(metrics):
+            state, metrics = compiled(state)
+            if problem := loop.not_finite(jax.device_get(metrics)):
                 break
-        sound = _finite(state.learner) and _finite(state.scenes)
-        diverged = int(metrics.physics_diverged.sum())
-        good = sound == (told is None) and (kind == "scene") == (told is None)
-        good = good and (kind != "scene" or diverged == 1)
-        text = f"NaN in a {kind}: told {told}, sound {sound}, {diverged} scenes"
-        tally.check(good, "silent", text)
+        lost = [leaf for leaf in jax.tree.leaves(state.learner) if not _finite(leaf)]
+        text = f"NaN in a {kind}: {problem}, {len(lost)} leaves lost"
+        tally.check(problem is not None and lost, "silent", text)
+
+
+def _finite(leaf: jax.Array) -> bool:
+    is_float = jnp.issubdtype(leaf.dtype, jnp.floating)
+    return not is_float or bool(jnp.isfinite(leaf).all())
 
 
 def _poisoned(rng: Rng, state: step.TrainState, kind: str) -> step.TrainState:
-    """Returns the state with one NaN more."""
-
-    def spoilt(leaf: jax.Array) -> jax.Array:
-        flat = np.array(leaf)
-        flat.reshape(-1)[rng.integers(flat.size)] = np.nan
-        return jnp.asarray(flat)
-
-    if kind == "scene":
-        scene = state.scenes.scene
-        spoilt_scene = scene.replace(velocity=spoilt(scene.velocity))
-        return state.replace(scenes=state.scenes.replace(scene=spoilt_scene))
     if kind == "reward":
         items = state.replay.items
-        items = items.replace(reward=items.reward.at[int(rng.integers(128))].set(jnp.nan))
+        items = items.replace(reward=items.reward.at[int(rng.integers(8))].set(jnp.nan))
         return state.replace(replay=state.replay.replace(items=items))
     # Adam's moments keep what a gradient was
     part = "critic_optimiser" if kind == "gradient" else str(rng.choice(["online", "target"]))
     leaves, structure = jax.tree.flatten(getattr(state.learner, part))
     floats = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     chosen = int(rng.choice(floats))
-    leaves[chosen] = spoilt(leaves[chosen])
+    flat = np.array(leaves[chosen])
+    flat.reshape(-1)[rng.integers(flat.size)] = np.nan
+    leaves[chosen] = jnp.asarray(flat)
     poisoned = {part: jax.tree.unflatten(structure, leaves)}
     return state.replace(learner=state.learner.replace(**poisoned))
-
-
-def _finite(tree: object) -> bool:
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)

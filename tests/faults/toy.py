@@ -6,6 +6,7 @@ imports.
 
 import contextlib
 import dataclasses
+import functools
 import json
 import multiprocessing
 import os
@@ -13,9 +14,8 @@ import resource
 import threading
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
@@ -40,8 +40,6 @@ LONG = 10_000 * E  # actions that no try comes to the end of
 
 @struct.dataclass
 class State:
-    """State of a training: key, counter, numbers."""
-
     key: jax.Array
     step: jax.Array
     total: jax.Array  # [4] float32
@@ -49,97 +47,56 @@ class State:
 
 
 def config(actions: int = LONG, seed: int = 5) -> Config:
-    """Returns a config with chunks of one step, each of them saved."""
     train = TrainConfig(scenes=E, actions=actions, learning_starts=4 * E, chunk=1, save_every=1)
     return presets.smoke().change(train=dataclasses.asdict(train), seed=seed)
 
 
 def first_state(seed: int = 5) -> State:
-    """Returns the state of step 0."""
     zeros = jnp.zeros(4, jnp.float32), jnp.zeros((64, 64), jnp.uint16)
     return State(jax.random.key(seed), jnp.int32(0), *zeros)
 
 
 def abstract_state() -> Any:
-    """Returns the shapes and dtypes of a state."""
     return jax.eval_shape(first_state)
 
 
-class Losses(NamedTuple):
-    """Steps at which numbers that are not finite enter."""
-
-    loss: int = -1
-    parameter: int = -1
-
-
-SOUND = Losses()
-
-
-def compile_chunk(num_steps: int, bad: Losses = SOUND) -> Any:
-    """Replaces `halves.compile_chunk`."""
-
+def compile_chunk(num_steps: int) -> Any:
     def step(state: State, _: None) -> tuple[State, StepMetrics]:
         outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
-        loss = jnp.where(state.step == bad.loss, jnp.nan, 1.0).astype(jnp.float32)
         total = state.total + state.step.astype(jnp.float32)
-        total = jnp.where(state.step == bad.parameter, jnp.nan, total)
         packed = 3 * state.packed + jnp.arange(64, dtype=jnp.uint16)[None]
-        metrics = step_metrics(
-            E,
-            loss=loss,
-            primitive=jnp.ones(E, jnp.int32),
-            outcome=outcome,
-            reward=outcome.astype(jnp.float32),
-            finite=jnp.isfinite(total).all(),
-        )
+        shown = {"outcome": outcome, "reward": outcome.astype(jnp.float32)}
+        metrics = step_metrics(E, loss=jnp.float32(1.0), primitive=jnp.ones(E, jnp.int32), **shown)
         return State(state.key, state.step + 1, total, packed), metrics
 
     return jax.jit(lambda state: jax.lax.scan(step, state, length=num_steps), donate_argnums=0)
 
 
 class Quiet:
-    """A reporter that records messages; sets the stop flag after `stop_after` chunks."""
+    """A reporter that shows nothing and sets the stop flag after `stop_after` chunks."""
 
-    def __init__(self, stop: signals.Stop | None = None, stop_after: int | None = None) -> None:
-        self.stop, self.said, self.chunks = stop or signals.Stop(), [], 0
-        self._stop_after = stop_after
+    def __init__(self, stop: signals.Stop, stop_after: int) -> None:
+        self._stop, self._left = stop, stop_after
 
     def log(self, text: str) -> None:
-        """Records a message."""
-        self.said.append(text)
+        pass
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Counts a chunk."""
-        self.chunks += 1
-        if self.chunks == self._stop_after:
-            self.stop.signal = 15
+        self._left -= 1
+        if self._left == 0:
+            self._stop.signal = 15
 
 
 def train(
-    run_dir: Path,
-    steps: int,
-    resume: bool = False,
-    seed: int = 5,
-    bad: Losses = SOUND,
-    at: int | None = None,
-    init: Callable[[], Any] | None = None,
+    run_dir: Path, steps: int, resume: bool = False, seed: int = 5, stop: signals.Stop | None = None
 ) -> Summary:
     """Trains in this process for `steps` more steps, of a run that has no end."""
-    reporter = Quiet(stop_after=steps)
-    return loop.run(
-        config(seed=seed),
-        run_dir,
-        init or (lambda: first_state(seed)),
-        lambda num_steps: compile_chunk(num_steps, bad),
-        reporter,
-        reporter.stop,
-        resume,
-        at,
-    )
+    cfg, stop = config(seed=seed), stop or signals.Stop()
+    begin, reporter = functools.partial(first_state, seed), Quiet(stop, steps)
+    return loop.run(cfg, run_dir, begin, compile_chunk, reporter, stop, resume)
 
 
 def bits(state: State) -> bytes:
-    """Returns all numbers of a state."""
     leaves = jax.random.key_data(state.key), state.step, state.total, state.packed
     return b"".join(np.asarray(leaf).tobytes() for leaf in leaves)
 
@@ -147,13 +104,12 @@ def bits(state: State) -> bytes:
 class Reference:
     """The states and records of an uninterrupted run, by step."""
 
-    def __init__(self, seed: int = 5) -> None:
-        self._chunk, self._state = compile_chunk(1), first_state(seed)
+    def __init__(self) -> None:
+        self._chunk, self._state = compile_chunk(1), first_state()
         self.states = [bits(self._state)]
         self.outcomes: list[dict[str, int]] = []
 
     def state(self, step: int) -> bytes:
-        """Returns the numbers of the state of a step."""
         while len(self.states) <= step:
             self._state, metrics = self._chunk(self._state)
             self.states.append(bits(self._state))
@@ -164,11 +120,8 @@ class Reference:
 
 
 def fault_of(run_dir: Path, reference: Reference, saved: int) -> str | None:
-    """Returns the fault of a run whose last finished save was of step `saved`, if any.
-
-    Its newest sound checkpoint must be that or a newer one, with its state bit for bit; its log
-    must reach as far and have the right lines.
-    """
+    """Returns the fault of a run that saved step `saved`: that or a newer one must come back, bit
+    for bit, and the log must reach as far."""
     if saved == 0 and checkpoint.latest_step(run_dir) is None:
         return None
     try:
@@ -198,7 +151,6 @@ class Order:
 
     run_dir: Path
     resume: bool = False
-    seed: int = 5
     steps: int = LONG
     held: bool = False  # waits after its first save until it is told to go on
     user: int | None = None  # whose rights it has
@@ -257,22 +209,18 @@ class Child:
         return None if said else f"ended with {self.process.exitcode} and said nothing"
 
     def go(self) -> None:
-        """Lets it go on that holds, if it lives."""
         with contextlib.suppress(BrokenPipeError):
             self._pipe.send(None)
 
     def end(self, limit: float) -> bool:
-        """Takes the rest of what it says; whether it ended within `limit` s. It is dead then."""
+        """Listens to its end; returns whether that came within `limit` s. Kills it if not."""
         self.listen(limit)
         self.process.join(max(limit / 10, 1.0))
         hung = self.process.is_alive()
-        self.process.kill()
-        self.process.join()
-        self.listen(0.1)
+        self.kill()
         return not hung
 
     def kill(self) -> None:
-        """Kills it by SIGKILL."""
         self.process.kill()
         self.process.join()
         self.listen(0.1)
@@ -286,32 +234,22 @@ def _obey(pipe: Any, stderr: Any, order: Order) -> None:
     stop = signals.install()
     if order.user is not None:
         os.setresuid(order.user, order.user, order.user)
-    save = checkpoint.save
+    save, held = checkpoint.save, [order.held]
 
     def saving(run_dir: Path, step: int, *rest: Any) -> Path:
         folder = save(run_dir, step, *rest)
         pipe.send(("saved", step))
-        if order.held and saving.first:  # type: ignore[attr-defined]
+        if held.pop():
             pipe.recv()
+        held.append(False)
         if order.largest is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (order.largest, resource.RLIM_INFINITY))
-        saving.first = False  # type: ignore[attr-defined]
         return folder
 
-    saving.first = True  # type: ignore[attr-defined]
     checkpoint.save = saving
     warnings.simplefilter("ignore")
-    reporter = Quiet(stop, order.steps)
     try:
-        loop.run(
-            config(seed=order.seed),
-            order.run_dir,
-            lambda: first_state(order.seed),
-            compile_chunk,
-            reporter,
-            stop,
-            order.resume,
-        )
+        train(order.run_dir, order.steps, order.resume, stop=stop)
         pipe.send(("done", True))
     except (SettingsError, FailedError, OSError) as error:
         pipe.send(("error", str(error)))

@@ -228,7 +228,7 @@ def test_bad_folders(tmp_path: Path):
     (tmp_path / "sweep.json").write_text("{")
     with pytest.raises(SweepError, match="cannot be read"):
         runner.read_plan(tmp_path)
-    with pytest.raises(SweepError, match="same values"):
+    with pytest.raises(SettingsError, match="same values"):
         runner.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
 
 
