@@ -163,9 +163,12 @@ class DenseNetHead(nn.Module):
         hidden = nn.Dense(cfg.head, use_bias=False, dtype=compute_dtype(cfg), name="conv0")(hidden)
         hidden = nn.relu(_norm(cfg, [_piece(hidden)], train, "norm1")).astype(jnp.float32)
         maps = nn.Dense(OUTPUTS, kernel_init=OUTPUT_INIT, name="conv1")(hidden)
-        *batch, rows, cols, outputs = maps.shape
-        factor = DenseNet121.STRIDE // (cfg.upsample * cfg.output_stride)
-        return jax.image.resize(maps, (*batch, factor * rows, factor * cols, outputs), "bilinear")
+        return _upsample(maps, DenseNet121.STRIDE // (cfg.upsample * cfg.output_stride))
+
+
+def _upsample(maps: jax.Array, factor: int) -> jax.Array:
+    *batch, rows, cols, channels = maps.shape
+    return jax.image.resize(maps, (*batch, factor * rows, factor * cols, channels), "bilinear")
 
 
 class DenseNetCritic(nn.Module):

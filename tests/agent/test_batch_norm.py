@@ -143,16 +143,6 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
 
 
 @pytest.mark.slow
-def test_targets_follow_statistics_too(learner, state, updated):
-    """Claim: target networks follow running statistics as they follow parameters."""
-    tau = learner.cfg.learn.tau
-    online, target, after = updated[0].online.critic, state.target.critic, updated[0].target.critic
-    wanted = jax.tree.map(lambda new, old: tau * new + (1.0 - tau) * old, online, target)
-    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), after, wanted)
-    assert not _same(after["batch_stats"], target["batch_stats"])
-
-
-@pytest.mark.slow
 def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
     """Claim: an update of the actor moves its own parameters and statistics alone."""
     obs = heightmap.unpack(batch.obs)

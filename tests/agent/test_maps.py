@@ -231,15 +231,6 @@ def test_target_task_grasps_the_target_alone(frames, block):
     assert np.all(valid[PUSH] == frames.inside)
 
 
-def test_best_cells(frames):
-    """Claim: the largest valid values in their order; if none is valid, the largest of all."""
-    values, valid = _random_maps(frames)[GRASP], _random_maps(frames, 1)[GRASP] > 0.5
-    flat = np.asarray(values).reshape(-1)
-    only = np.where(np.asarray(valid).reshape(-1), flat, -np.inf)
-    assert_array_equal(maps.best_cells(values, valid, 5), np.argsort(-only)[:5])
-    assert_array_equal(maps.best_cells(values, valid & False, 5), np.argsort(-flat)[:5])
-
-
 def test_normalise_is_inverse(frames):
     """Claim: pose to box and back is the same pose, with the yaw in [0, 2 pi)."""
     poses = jnp.asarray(_poses(100), jnp.float32)

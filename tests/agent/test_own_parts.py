@@ -109,14 +109,6 @@ def test_learner_and_sampler_of_ones_own():
     assert_array_equal(metrics.actor_loss, 0.0)
 
 
-def test_learner_lacking_a_method_is_none():
-    """Claim: a learner without `act`, `init` or `update` cannot be made."""
-    for name in ("act", "init", "update"):
-        methods = {other: vars(Mean)[other] for other in {"act", "init", "update"} - {name}}
-        with pytest.raises(TypeError, match=name):
-            type("Lacking", (Learner,), methods)()
-
-
 def test_network_of_ones_own():
     """Claim: a Flax module with a `stride` is the critic: its maps are cells of that size, its
     parameters are learned after the warm-up, and so are those of the actor's head on its

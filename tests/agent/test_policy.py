@@ -15,7 +15,6 @@ from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
-from csac_jax.sim.outcome import BARE
 
 KEYS = 20
 
@@ -78,22 +77,6 @@ def test_greedy_picks_the_better_primitive(frames, best, primitive):
     assert np.all(away < 0.5 * frames.cell)
 
 
-def test_random_grasps_land_on_blocks(cfg, frames, observations):
-    """Claim: a random grasp is above a block, and takes every yaw."""
-    obs = jax.tree.map(lambda leaf: leaf[0], observations(1, 3))
-    valid = maps.actionable_cells(frames, obs)
-    keys = jax.random.split(jax.random.key(1), 400)
-    action = jax.jit(jax.vmap(lambda key: policy.random_grasp(key, frames, valid)))(keys)
-    assert np.all(action.primitive == Primitive.GRASP)
-    height, size = np.asarray(obs.height), cfg.heightmap.size
-    cells = np.asarray(action.pose[:, :2] / cfg.heightmap.cell + 0.5 * (size - 1)).astype(int)
-    for c, r in cells:  # a cell of the maps covers about 2 x 2 of the height map, turned
-        assert height[max(r - 1, 0) : r + 3, max(c - 1, 0) : c + 3].max() > BARE
-    index = np.round(np.asarray(maps.yaw_index(frames, action.pose[:, 2]))) % frames.yaws.size
-    assert set(index) == set(range(frames.yaws.size))
-    assert np.mean(height > BARE) < 0.3  # it would be easy otherwise
-
-
 def test_best_pixel(cfg, frames, parts):
     """Claim: with `argmax` a primitive's pose is NumPy's largest valid cell, whatever the key."""
     own, state = parts(cfg.change(policy={"place": "argmax"})), _state(frames, 4)
@@ -152,19 +135,6 @@ def test_retries_follow_boltzmann(cfg, frames, parts, failed):
     share = np.bincount(off.argmin(axis=1), minlength=4) / len(off)
     wanted = np.exp(values / 0.5) if failed else np.array([1.0, 0.0, 0.0, 0.0])
     assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
-
-
-@pytest.mark.parametrize("steps_without_change", [0, 1])
-@pytest.mark.slow
-def test_rule_reaches_the_action(cfg, frames, parts, steps_without_change):
-    """Claim: what is done follows the rule, where values say the opposite."""
-    rule = {"policy": {"primitive": "rule"}, "explore": {"epsilon_primitive": (0.0, 0.0)}}
-    own, state = parts(cfg.change(**rule)), _state(frames, 5)
-    wrong = Primitive.GRASP if steps_without_change else Primitive.PUSH
-    state = state.replace(q=state.q.at[wrong].add(5.0))
-    best = jax.jit(lambda steps: policy.best_action(jax.random.key(0), own, state, steps))
-    assert best(jnp.int32(steps_without_change)).primitive == 1 - wrong
-    assert _explore(own, state, 1, steps_without_change).primitive[0] == 1 - wrong
 
 
 def test_grasp_only_never_pushes(cfg, frames, parts):

@@ -96,20 +96,6 @@ def test_stored_label_stays_as_an_option(cfg, observations):
     )
 
 
-@pytest.mark.slow
-def test_update_does_not_depend_on_the_stored_label(renewing, observations):
-    """Claim: the TD error of a push is the same whatever label was stored with it."""
-    state = _weighted(renewing, 1.0)
-    errors = []
-    for stored, reward in ((False, -0.5), (True, 0.5)):
-        batch = _batch(observations, stored, reward)
-        batch = jax.tree.map(lambda leaf: leaf[::2], batch)  # pushes alone
-        weights = jnp.ones(B // 2)
-        update = critic.update(jax.random.key(1), renewing, state, batch, weights)
-        errors.append(update[1].error)
-    assert_array_equal(*errors)
-
-
 @pytest.mark.parametrize("num", [1, 5])
 def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""

@@ -120,13 +120,6 @@ class TestRingModelLong(RingModel.TestCase):
     settings = settings(max_examples=10_000, stateful_step_count=8, deadline=None)
 
 
-def test_new_items_rank_with_the_largest_error():
-    """Claim: a new item's priority is the largest stored, 1 at first."""
-    assert filled_ring([1]).priority.tolist() == [1.0] + [0.0] * (CAPACITY - 1)
-    state = set_errors(filled_ring([1, 2]), jnp.array([0, 1]), jnp.array([0.3, -0.7]))
-    assert add(state, items([3]), jnp.array([True])).priority[2] == np.float32(0.7)
-
-
 def test_errors_that_are_not_numbers():
     """Claim: NaN and infinity count as the largest that the slots of the batch have or had; huge
     errors are cut off, so that sums are finite: the ring never holds anything else."""
@@ -147,16 +140,6 @@ def test_gather_returns_the_items_of_its_slots():
     batch = gather(filled_ring([1, 2, 3]), jnp.array([2, 0, 2]))
     assert batch["id"].tolist() == [3, 1, 3]
     assert batch["map"][:, 0, 0].tolist() == [3, 1, 3]
-
-
-def test_types_are_those_of_the_example():
-    """Claim: add and set_priorities keep types and shapes: a compiled loop takes them again."""
-    state = empty()
-    added = add(state, items([1]), jnp.array([True]))
-    updated = set_errors(added, jnp.array([0]), jnp.array([1.0]))
-    describe = lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type)  # noqa: E731
-    first, second, third = (jax.tree.map(describe, s) for s in (state, added, updated))
-    assert first == second == third
 
 
 def test_too_many_items_at_once():

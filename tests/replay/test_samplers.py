@@ -1,7 +1,6 @@
 """Drawn transitions against the laws by SciPy."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -365,40 +364,6 @@ def test_weights_by_formula(progress, law):
     assert np.unique(weights).size > 1
 
 
-def test_full_weights_take_the_bias_away():
-    """Claim: with exponent 1, a weighted mean over prioritised draws is the mean over what is
-    stored. Uniform and beta draws have weights of 1, whatever the errors."""
-    full = prioritised(is_beta=(1.0, 1.0))
-    values = np.random.default_rng(0).uniform(1.0, 2.0, CAPACITY).astype(np.float32)
-    slots, weights = drawn(full, stored(full, values**3))
-    assert values[slots].mean() > values.mean() + 0.05
-    assert_allclose(np.average(values[slots], weights=weights), values.mean(), atol=0.01)
-    for name in ("uniform", "beta"):
-        _, weights = drawn(SAMPLERS[name], stored(SAMPLERS[name], values**3), 64, 0.3)
-        assert_array_equal(weights, 1.0)
-
-
-@pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
-def test_batched_seeds_are_each_by_itself(sampler):
-    """Claim: draws and updates of three seeds under vmap are those of each seed alone."""
-    errors = np.random.default_rng(0).normal(size=(3, 100))
-    states = [stored(sampler, errors[seed], 70 + seed) for seed in range(3)]
-    keys = jax.random.split(jax.random.key(0), 3)
-
-    def step(key, state):
-        slots, weights = sampler.sample(key, state, jnp.float32(0.3), 32)
-        errors = jnp.sin(slots.astype(jnp.float32))
-        return slots, weights, sampler.update(state, slots, errors).priority
-
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    together = jax.jit(jax.vmap(step))(keys, stacked)
-    for i, (key, state) in enumerate(zip(keys, states, strict=True)):
-        alone = jax.jit(step)(key, state)
-        assert_array_equal(together[0][i], alone[0])
-        assert_allclose(together[1][i], alone[1], rtol=1e-6)
-        assert_allclose(together[2][i], alone[2], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("progress", "expected"),
     [(-1.0, (0.5, 0.5)), (0.0, (0.5, 0.5)), (0.2, (0.75, 0.75)), (0.4, (1.0, 1.0)),
@@ -421,37 +386,3 @@ def test_sampler_follows_the_schedule():
     cfg = BetaReplay(start=(1.0, 2.0), middle=(1.0, 2.0), end=(1.0, 2.0))
     for progress in np.linspace(-0.5, 1.5, 21):
         assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
-
-
-@pytest.mark.slow
-def test_as_a_sum_tree_after_a_million_updates():
-    """Claim: after 1,000,000 updates with priorities from 1e-6 to 1e6, the sum of all masses and
-    the probabilities are those of flashbax's sum tree to 1e-4, and those of NumPy in float64 to
-    1e-5."""
-    sum_tree = pytest.importorskip("flashbax.buffers.sum_tree")
-    capacity, batch, updates = 2**12, 64, 2**20
-    sampler = prioritised(per_epsilon=1e-9)
-    rng, rounds, all_slots = np.random.default_rng(0), updates // batch, jnp.arange(capacity)
-    priorities = (10.0 ** rng.uniform(-6.0, 6.0, (rounds, batch))).astype(np.float32)
-    slots = [rng.choice(capacity, batch, replace=False) for _ in range(rounds)]
-    slots = np.stack(slots).astype(np.int32)
-
-    def update(carry, batch):
-        state, tree = carry
-        state = sampler.update(state, *batch)
-        return (state, sum_tree.set_batch_scan(tree, batch[0], state.priority[batch[0]])), None
-
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        full, tree = stored(sampler, jnp.ones(capacity)), sum_tree.init(capacity)
-        begun = (full, sum_tree.set_batch_scan(tree, all_slots, full.priority))
-        scan = jax.jit(functools.partial(jax.lax.scan, update))
-        (state, tree), _ = scan(begun, (slots, priorities))
-        theirs = jax.vmap(functools.partial(sum_tree.get_probability, tree))(all_slots)
-    truth = np.ones(capacity)
-    for these, new in zip(slots, priorities, strict=True):
-        truth[these] = (new.astype(float) + 1e-9) ** sampler.cfg.alpha
-    top, ours = samplers._pyramid(state.priority)[0][0].sum(), np.asarray(state.priority, float)
-    assert_allclose(top, truth.sum(), rtol=1e-5)
-    assert_allclose(top, tree.nodes[0], rtol=1e-4)
-    assert_allclose(ours / float(top), truth / truth.sum(), rtol=1e-5)
-    assert np.abs(ours / float(top) - np.asarray(theirs, float)).sum() < 1e-4
