@@ -199,12 +199,9 @@ def test_damage_is_noticed(tmp_path: Path, params: Params):
         policy_file.load(path)
 
 
-@pytest.mark.parametrize("name", ["csac-jax", "jax", "mujoco"])
-def test_other_versions_are_named(
-    tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch, name: str
-):
-    """Claim: a policy of another version of the package, JAX or MuJoCo loads with a warning that
-    names both versions."""
+def test_other_versions_are_named(tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a policy of another version of JAX loads with a warning that names both versions."""
+    name = "jax"
     here, path = policy_file.provenance.versions(), tmp_path / "policy.safetensors"
     with monkeypatch.context() as patch:
         patch.setattr(policy_file.provenance, "versions", lambda: {**here, name: "0.0.1"})
@@ -235,20 +232,6 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path: Path, params: Params,
     with pytest.raises(PolicyFileError, match="is not finite"):
         policy_file.save(tmp_path / "new.safetensors", lost, CFG)
     assert not (tmp_path / "new.safetensors").exists()
-
-
-@pytest.mark.parametrize(
-    "config", ["[]", "[" * 100_000, "3", '{"format": 2, "learn": {"tau": 1' + "0" * 400 + "}}"]
-)
-def test_hostile_config_is_one_line(tmp_path: Path, params: Params, config: str):
-    """Claim: whatever stands for a policy's config, the answer is one line."""
-    path = tmp_path / "policy.safetensors"
-    policy_file.save(path, params, CFG)
-    _rewrite(path, lambda tensors, remarks: remarks.update(config=config))
-    with pytest.warns(DataWarning), pytest.raises(PolicyFileError) as caught:
-        policy_file.load(path)
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < len(str(path)) + 300
 
 
 def _file_with(dtype: str) -> bytes:
