@@ -199,13 +199,8 @@ def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
     ("flags", "changes"),
     [
         (
-            "--seed 3 --learn.batch 4 --scene.slots box prism --replay.end 2 3",
-            {
-                "seed": 3,
-                "learn": {"batch": 4},
-                "scene": {"slots": ("box", "prism")},
-                "replay": {"end": (2.0, 3.0)},
-            },
+            "--seed 3 --scene.slots box prism --replay.end 2 3",
+            {"seed": 3, "scene": {"slots": ("box", "prism")}, "replay": {"end": (2.0, 3.0)}},
         ),
         ("--replay.sampler=uniform", {"replay": UniformReplay(capacity=SMOKE.replay.capacity)}),
         (
@@ -615,9 +610,7 @@ def test_summary_is_printed(capsys: pytest.CaptureFixture):
     }
     evaluate.print_summary("random in 1 episode", summary)
     shown = capsys.readouterr().out
-    assert "90.0 %" in shown
-    assert "lifted 9" in shown
-    assert "1.250" in shown
+    assert all(text in shown for text in ("90.0 %", "lifted 9", "1.250"))
     assert "125" not in shown  # blocks per action are no share
     assert "-" in next(line for line in shown.splitlines() if "completion" in line)
 

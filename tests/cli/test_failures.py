@@ -18,6 +18,7 @@ from csac_jax.errors import FailedError, SceneError, SettingsError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.render import gl
 from csac_jax.runtime import cache, signals
+from csac_jax.sweeps import runner
 from csac_jax.training import loop, programs
 from csac_jax.training.callbacks import Summary
 from csac_jax.training.progress import Terminal
@@ -112,28 +113,23 @@ def test_missing_extra(
     assert _run(capsys, arguments) == (2, "", wanted)
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "line"),
-    [
-        (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
-        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
-    ],
-)
-def test_training_that_fails(
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
-    code: int,
-    line: str,
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_work_that_fails(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: str
 ):
-    """Claim: a run that fails, or whose folder another process makes meanwhile, is one line and an
+    """Claim: work that fails, or whose folder another process makes meanwhile, is one line and an
     exit code."""
     monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
-    monkeypatch.setattr(loop, "run", _raises(error))
-    ended, _, text = _run(capsys, "train smoke --run-dir there")
-    assert (ended, text.count("\n")) == (code, 1)
-    assert text.startswith(f"csac-jax: {line}")
+    for error, code, line in (
+        (FileExistsError(), 2, "there exists; give another --run-dir"),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (runner.SweepError("all are lost"), 1, "all are lost"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ):
+        monkeypatch.setattr(loop if command == "train" else runner, "run", _raises(error))
+        ended, _, text = _run(capsys, f"{command} smoke --run-dir there")
+        assert (ended, text.count("\n")) == (code, 1)
+        assert text.startswith(f"csac-jax: {line}")
 
 
 def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
