@@ -299,7 +299,7 @@ def test_both_levels_of_a_push_are_reached(lab: Lab):
     for low, high, moved in zip(*phi, after.info.moved[:4], strict=True):
         phis, nothing = (jnp.float32(low), jnp.float32(high)), jnp.int32(Outcome.NOTHING)
         result = rewards.ActionResult(push, nothing, zero, *phis, moved > CHANGE_AREA, jnp.int32(0))
-        level.append(float(rewards.push_effect(cfg, result)))
+        level.append(float(rewards.push_effect(cfg, rewards.gains_value(cfg, *phis))))
         reward.append(float(rewards.reward(cfg, result)))
     assert level == [1.0, -1.0, -1.0, -1.0]
     assert reward == [0.5, -0.5, -0.5, -0.5]  # Gamma = 0.5, eq. 13

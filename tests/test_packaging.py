@@ -29,15 +29,14 @@ COMMANDS = (
 
 def test_versions_agree():
     """Claim: package, CITATION.cff and the newest heading of CHANGELOG.md name one version, and
-    the classifiers begin with the oldest Python that is let in."""
+    the classifiers begin with the oldest Python that is let in. Both commands are one."""
     version = csac_jax.__version__
     assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
-    headings = [
-        line for line in (ROOT / "CHANGELOG.md").read_text().splitlines() if line[:3] == "## "
-    ]
-    assert headings[0].split(",")[0] == f"## {version}"
+    newest = (ROOT / "CHANGELOG.md").read_text().split("\n## ")[1]
+    assert newest.split("\n")[0].split(",")[0] == version
     minor = [line.split("3.")[1] for line in PROJECT["classifiers"] if ":: 3." in line]
     assert PROJECT["requires-python"] == f">=3.{minor[0]}"
+    assert PROJECT["scripts"] == dict.fromkeys(("csac-jax", "csac_jax"), "csac_jax.cli:main")
 
 
 def test_extras_are_sorted_and_pinned():
@@ -91,15 +90,8 @@ def test_installed_package_works(built: Path, tmp_path: Path):
     venv.create(tmp_path / "venv", with_pip=True)
     wheel = next(built.glob("*.whl"))
     python = str(tmp_path / "venv/bin/python")
-    install = [
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "-c",
-        str(ROOT / "constraints.txt"),
-        f"{wheel}[report]",
-    ]
+    constraints = ["-c", str(ROOT / "constraints.txt")]
+    install = ["-m", "pip", "install", "-q", *constraints, f"{wheel}[report]"]
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     subprocess.run([python, *install], check=True, env=clean, capture_output=True)
     where = "import csac_jax; print(csac_jax.__file__)"

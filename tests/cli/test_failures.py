@@ -12,12 +12,13 @@ import pytest
 from rich.console import Console
 
 import csac_jax
-from csac_jax import cli, presets
+from csac_jax import algorithms, cli, presets
 from csac_jax.cli import doctor
 from csac_jax.errors import FailedError, SceneError, SettingsError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.render import gl
 from csac_jax.runtime import cache, signals
+from csac_jax.sweeps import runner
 from csac_jax.training import loop, programs
 from csac_jax.training.callbacks import Summary
 from csac_jax.training.progress import Terminal
@@ -86,6 +87,7 @@ def test_usage_and_version(capsys: pytest.CaptureFixture):
         assert (code, line) == (wanted, "")
         rows = [row.split()[0] for row in shown.splitlines() if row[:2] == "  " and row[2] != " "]
         assert sorted(set(rows)) == sorted(cli.COMMANDS)
+        assert not shown or all(name in shown for name in algorithms.ALGORITHMS)
     assert _run(capsys, "--version") == (0, f"{csac_jax.__version__}\n", "")
 
 
@@ -111,48 +113,23 @@ def test_missing_extra(
     assert _run(capsys, arguments) == (2, "", wanted)
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "line"),
-    [
-        (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
-        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
-    ],
-)
-def test_training_that_fails(
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
-    code: int,
-    line: str,
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_work_that_fails(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: str
 ):
-    """Claim: a run that fails, or whose folder another process makes meanwhile, is one line and an
+    """Claim: work that fails, or whose folder another process makes meanwhile, is one line and an
     exit code."""
     monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
-    monkeypatch.setattr(loop, "run", _raises(error))
-    ended, _, text = _run(capsys, "train smoke --run-dir there")
-    assert (ended, text.count("\n")) == (code, 1)
-    assert text.startswith(f"csac-jax: {line}")
-
-
-def test_networks_that_cannot_be_restored(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-):
-    """Claim: a run whose config can be read and whose networks cannot is one line and exit code 1;
-    nothing is made."""
-    checkpoint.save(Path("run"), 4, {"step": jnp.int32(4)}, SMOKE, {"seconds": 1.0, "grasps": []})
-    monkeypatch.setattr(checkpoint, "restore", _raises(checkpoint.CheckpointError("4 is damaged")))
-    assert _run(capsys, "export run p.safetensors") == (1, "", "csac-jax: 4 is damaged\n")
-    assert not Path("p.safetensors").exists()
-
-
-@pytest.mark.parametrize("command", ["eval {}", "play --policy {}", "export {} p.safetensors"])
-def test_file_that_holds_no_policy(capsys: pytest.CaptureFixture, command: str):
-    """Claim: a file that is no policy is one line and exit code 1."""
-    Path("x.safetensors").write_bytes(b"\x80\x04not this")
-    code, shown, line = _run(capsys, command.format("x.safetensors"))
-    assert line.startswith("csac-jax: x.safetensors cannot be read as .safetensors")
-    assert (code, shown, line.count("\n")) == (1, "", 1)
+    for error, code, line in (
+        (FileExistsError(), 2, "there exists; give another --run-dir"),
+        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
+        (runner.SweepError("all are lost"), 1, "all are lost"),
+        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
+    ):
+        monkeypatch.setattr(loop if command == "train" else runner, "run", _raises(error))
+        ended, _, text = _run(capsys, f"{command} smoke --run-dir there")
+        assert (ended, text.count("\n")) == (code, 1)
+        assert text.startswith(f"csac-jax: {line}")
 
 
 def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
@@ -218,17 +195,6 @@ def test_lines_are_printed_on_any_terminal(
     with pytest.raises(SystemExit):
         cli.main(["train", "smoke", "--help-all"])
     assert "--learn.tau" in capsys.readouterr().out
-
-
-def test_values_without_end_are_refused(capsys: pytest.CaptureFixture):
-    """Claim: an infinite step size and a list of 100,000 items are one short line."""
-    for flags, message in (
-        ("--learn.learning-rate inf", "learn.learning_rate: must be at most"),
-        (f"--net.dilations {'1 ' * 100_000}", "net.dilations: at most 64 items, not 100000"),
-    ):
-        code, _, line = _run(capsys, f"train smoke {flags}")
-        assert message in line
-        assert (code, line.count("\n"), len(line) < 200) == (2, 1, True)
 
 
 def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):

@@ -16,10 +16,10 @@ from csac_jax.cli import sweep as command
 from csac_jax.config import Config
 from csac_jax.evaluation import metrics
 from csac_jax.evaluation.suites import PreparedSuite
-from csac_jax.io import checkpoint, files
+from csac_jax.io import files
 from csac_jax.runtime import signals
 from csac_jax.sweeps import final, runner
-from csac_jax.training import loop, programs, step
+from csac_jax.training import programs, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
@@ -51,16 +51,12 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "sweep: give a preset first, one of: smoke, quick"),
         ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
-        ("smok", "unknown preset 'smok'; did you mean smoke?"),
         ("smoke --vary replay.sampler=uniform --replay.end 1 4", "uniform has no such setting"),
         ("smoke --vary learn.tua=0.1", "'learn.tua' is no setting; perhaps you meant learn.tau"),
         ("smoke --vary learn.tau=", "vary learn.tau=: give a setting and its values"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --vary learn.tau=0.1,2", "learn.tau: must be at most 1, not 2.0"),
-        ("smoke --vary algo=csac,dqn", "unknown algorithm 'dqn'"),
         ("smoke --vary learn.tau=0.1,0.10", "vary: two settings have the same values"),
         ("smoke --devices 4096", "devices: 4096 asked for, there are "),
         ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores"),
@@ -75,10 +71,7 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
             "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
             "process_id: must lie in 0 .. 1",
         ),
-        ("smoke --run-dir .", ". exists; give another --run-dir"),
         ("--resume x --learn.tau 0.1", "leave all others out"),
-        ("--resume x --seeds 5", "leave all others out"),
-        ("--resume x --run-dir y", "leave all others out"),
         ("quick --resume x", "leave all others out"),
     ],
 )
@@ -87,33 +80,6 @@ def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: s
     made; a folder without a sweep is exit code 1."""
     _fails(capsys, 2, arguments, message)
     _fails(capsys, 1, "--resume nowhere", "there is no sweep.json in nowhere")
-
-
-@pytest.mark.parametrize(
-    ("error", "code", "message"),
-    [
-        (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (runner.SweepError("all are lost"), 1, "all are lost"),
-        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
-        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
-    ],
-)
-def test_failures(
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
-    code: int,
-    message: str,
-):
-    """Claim: a sweep that fails is one line and an exit code; so is a folder that another
-    process makes meanwhile."""
-
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr(runner, "run", fail)
-    assert cli.main(["sweep", "smoke", "--run-dir", "there"]) == code
-    assert capsys.readouterr().err.startswith(f"csac-jax: {message}")
 
 
 def test_settings_reach_their_configs():
@@ -261,21 +227,6 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
         "base/seed-1",
     ]
     assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
-
-
-@pytest.mark.optax
-def test_benchmark(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `bench sweep` prints a row for each number of seeds, and the run of one seed by
-    itself, with where they come from. A small step stands in for the learner's."""
-    _with_toys(monkeypatch)
-    flags = "smoke --seeds 1 3 --repeats 1 --train.scenes 4"
-    assert cli.main(["bench", "sweep", *flags.split()]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert [(row["seeds"], row["devices"]) for row in found["rows"]] == [(1, 1), (3, 1)]
-    for row in found["rows"]:
-        assert row["actions_per_second"] == pytest.approx(row["seeds"] * 4 * 2 / row["seconds"])
-    assert found["train"]["compile_seconds"] > 0.0
-    assert {"preset", "device", "versions", "commit"} <= found.keys()
 
 
 def test_devices_of_other_processes_count():

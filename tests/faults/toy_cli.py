@@ -24,7 +24,7 @@ def _compile_init(cfg: Config) -> Callable[[], toy.State]:
     return functools.partial(toy.first_state, cfg.seed)
 
 
-def _compile_chunk(cfg: Config, num_steps: int, *_: object) -> object:
+def _compile_chunk(cfg: Config, num_steps: int, **_: object) -> object:
     return toy.compile_chunk(num_steps)
 
 

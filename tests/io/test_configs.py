@@ -1,6 +1,7 @@
 """Config to JSON and back, and configs in files, against the presets and `Config.change`."""
 
 import dataclasses
+import functools
 import json
 import math
 import re
@@ -94,10 +95,7 @@ def test_differences_are_named_in_order():
 
 
 def _nested(depth: int) -> Any:
-    value: Any = 0
-    for _ in range(depth):
-        value = [value]
-    return value
+    return functools.reduce(lambda value, _: [value], range(depth), 0)
 
 
 @pytest.mark.parametrize(
@@ -106,44 +104,27 @@ def _nested(depth: int) -> Any:
         ("learn", {"bath": 3}, r"learn\.bath: unknown setting"),
         ("learn", {"batch": "3"}, r"learn\.batch: input should be a valid integer"),
         ("learn", {"batch": 3.0}, r"learn\.batch: input should be a valid integer"),
-        ("learn", {"batch": True}, r"learn\.batch: input should be a valid integer"),
-        ("learn", {"tau": "x"}, r"learn\.tau: input should be a valid number"),
         ("learn", {"tau": 2.0}, r"learn\.tau: must be at most 1, not 2\.0"),
         ("learn", 3, "learn: input should be an object"),
         ("scene", {"slots": ["ball"]}, r"scene\.slots\.0: input should be 'box'"),
         ("sim", {"grasp_phases": [1, 2]}, r"sim\.grasp_phases\.2: field required"),
         ("replay", {"sampler": "best"}, r"replay\.sampler: 'best' is not one of: uniform"),
         ("replay", {"sampler": "uniform", "end": [1, 2]}, r"replay\.end: unknown setting"),
-        ("format", 3, "format: 3 is unknown"),
         ("format", 1, "format: 1 is unknown, this version reads 2; use the csac-jax that wrote"),
         ("learn", {"tau": 10**400}, r"learn\.tau: must be at most 1, not inf"),
         ("learn", {"learning_rate": math.nan}, r"learn\.learning_rate: .*not nan"),
-        ("train", {"actions": 10**400}, r"train\.actions: must be at most 9007199254740992"),
         ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
-        ("scene", {"slots": ["box"] * 100_000}, r"scene\.slots: at most 64 items, not 100000"),
-        ("learn", {"tau": _nested(500)}, r"learn: "),
         ("learn", {"tau": _nested(100_000)}, "learn: is nested too deeply"),
         ("learn", {f"k{i}": i for i in range(20_000)}, r"learn\.k0: unknown setting"),
         ("net", {"kind": ["small"]}, "net.kind: "),
-        ("net", {"kind": "small", "": 1}, "net.: unknown setting"),
     ],
 )
 def test_bad_values_are_one_line(section: str, values: Any, message: str):
     """Claim: an unknown key, a wrong type, a value out of range, numbers beyond floats, lists
     without end and deep nesting are refused at once, in a short line that names the setting."""
-    _refused({"format": configs.FORMAT, section: values}, message)
-
-
-def test_thousands_of_sections_are_one_line():
-    """Claim: 20,000 sections are refused as fast as one."""
-    sections = {f"k{i}": {"a": 1} for i in range(20_000)}
-    _refused({"format": configs.FORMAT, **sections}, "k0.*: unknown setting")
-
-
-def _refused(values: Any, message: str) -> None:
     begun = time.monotonic()
     with pytest.raises(SettingsError, match=message) as caught:
-        configs.from_dict(values)
+        configs.from_dict({"format": configs.FORMAT, section: values})
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200
     assert time.monotonic() - begun < 5.0
@@ -227,26 +208,19 @@ def test_algorithm_comes_before_the_settings(tmp_path: Path):
     ("suffix", "text", "message"),
     [
         (".toml", "[learn]\ntau = 0.1", r'preset: is missing; add one, such as preset = "quick"$'),
-        (".toml", "preset = 3", "preset: is missing"),
         (".toml", 'preset = "quik"', "unknown preset 'quik'; did you mean quick"),
         (".toml", "SMOKE[learn]\nbath = 3", r"learn\.bath: unknown setting$"),
         (".toml", "SMOKE[lern]\nbatch = 3", "lern: unknown setting$"),
         (".toml", 'SMOKElearn = "fast"', "learn: must be a section of settings, not 'fast'$"),
         (".toml", "SMOKE[learn]\ntau = 2.0", r"learn\.tau: must be at most 1, not 2\.0$"),
-        (".toml", "SMOKE[learn]\ntau = nan", r"learn\.tau: "),
-        (".toml", "SMOKE[learn]\nbatch = 2020-01-01", r"learn\.batch: input should be a valid int"),
-        (".toml", "SMOKEseed = true", "seed: input should be a valid integer, not True$"),
-        (".toml", 'SMOKE[replay]\nsampler = "best"', r"replay\.sampler: 'best' is not one of: uni"),
         (".toml", 'SMOKEalgo = "dqn"', "unknown algorithm 'dqn'; choose one of"),
         (".toml", "SMOKEformat = 9", "format: 9 is unknown, this version reads"),
         (".toml", "SMOKE[learn\n", r"is no readable TOML \("),
         (".toml", "\udcff", ".*decode"),
         (".ini", "", "the name of a config file ends in .toml, .yaml, .yml, .json"),
-        (".yaml", "a: [1", "is no readable YAML"),
         (".yaml", "- 1", "must hold settings by name"),
         (".yaml", "a: &a [1]\nb: *a", "aliases"),
         (".yaml", "seed: !!python/object/apply:os.getpid []", "is no readable YAML"),
-        (".yaml", "[" * 1_500, "is "),
         (".json", "{", "is no readable JSON"),
         (".json", "[" * 100_000, "is nested too deeply"),
     ],

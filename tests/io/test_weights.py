@@ -84,14 +84,9 @@ def test_weights_reach_their_places(tmp_path, tensors):
         statistics["norm1"]["mean"], tensors[prefix + "norm1.running_mean"]
     )
     np.testing.assert_array_equal(statistics["norm2"]["var"], tensors[prefix + "norm2.running_var"])
-    wanted = sum(
-        t.sum(dtype=np.float64)
-        for n, t in tensors.items()
-        if "classifier" not in n and "tracked" not in n
-    )
-    np.testing.assert_allclose(
-        sum(leaf.sum(dtype=np.float64) for leaf in jax.tree.leaves(got)), wanted, rtol=1e-6
-    )
+    used = [t for n, t in tensors.items() if "classifier" not in n and "tracked" not in n]
+    sums = [sum(t.sum(dtype=np.float64) for t in each) for each in (jax.tree.leaves(got), used)]
+    np.testing.assert_allclose(*sums, rtol=1e-6)
     rounded = {name: tensor.astype(np.float16) for name, tensor in tensors.items()}
     half = weights.read(NET, _file(tmp_path / "h.safetensors", rounded))
     assert {leaf.dtype for leaf in jax.tree.leaves(half)} == {np.dtype("float32")}
@@ -136,19 +131,6 @@ def test_bad_tensor_is_named(tmp_path, tensors, change, message):
     change(tensors)
     path = _file(tmp_path / "w.safetensors", tensors)
     with pytest.raises(ValueError, match=f"^in .*w.safetensors, {message}; give .*$"):
-        weights.read(NET, path)
-
-
-@pytest.mark.parametrize("content", [None, b"", b"\x80\x04pickle"])
-def test_file_that_cannot_be_read(tmp_path, content):
-    """Claim: a file that is not there or is no .safetensors is an error of one line with its
-    name."""
-    path = tmp_path / "w.safetensors"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(
-        ValueError, match=r"^.*w.safetensors cannot be read as .safetensors \(.*\); give "
-    ):
         weights.read(NET, path)
 
 

@@ -192,7 +192,7 @@ def test_the_config_chooses_the_view():
         ({"heightmap": {"view": "side"}}, "heightmap.view"),
         ({"heightmap": {"size": 60}}, "heightmap.size"),
         ({"heightmap": {"size": 80}}, "net.pad_fraction"),
-        ({"net": {"rotations": 202}}, "net.rotations: at most 200"),
+        ({"net": {"rotations": 202}}, "net.rotations: must be even, at most 200"),
         ({"net": {"rotations": 15}}, "net.rotations"),
     ],
 )
