@@ -184,7 +184,7 @@ class DenseNetCritic(nn.Module):
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """Splits maps [B, C, C, I] into colour and, three times each, the others: [T, B, z C, z C, 3]."""
+    """Splits maps [B, C, C, I] into colour and, three times, the others: [T, B, z C, z C, 3]."""
     inputs = [maps[..., :3]] if cfg.colour else []
     others = range(3 * len(inputs), maps.shape[-1])
     inputs += [jnp.repeat(maps[..., i : i + 1], 3, axis=-1) for i in others]
