@@ -11,7 +11,6 @@ import optax
 from csac_jax import geometry
 from csac_jax.agent import maps, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
-from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
 
@@ -19,7 +18,7 @@ _WINDOW = np.arange(-2, 3)  # cells around the highest; of the whole map it lies
 _INWARD = 2 + np.array([-1, -1, 0, 1, 1])  # of each row: the next one towards the middle
 
 
-def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
+def pose(frames: maps.Frames, state: maps.DenseMaps, primitive: int) -> jax.Array:
     """Returns mu(s), the pose [3] (x m, y m, yaw rad) of one primitive; differentiable."""
     side, num = frames.side, frames.yaws.shape[0]
     best = maps.best_cells(state.logits[primitive], state.valid[primitive], 1)[0]
@@ -33,7 +32,6 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
     peak = jnp.minimum(peak, peak[_INWARD[:, None], _INWARD[None, :]])
     weight = jax.nn.softmax(peak.reshape(-1))  # [25]
     xy = jnp.sum(weight[:, None] * jnp.asarray(frames.xy)[window].reshape(-1, 2), axis=0)
-
     step = 2.0 * np.pi / num
     yaws = jnp.asarray(frames.yaws)[k] + step * np.array([-1, 0, 1], np.float32)
     yaw_logits = _along_yaw(frames, state, primitive, xy, geometry.wrap_angle(yaws))
@@ -42,7 +40,7 @@ def pose(frames: Frames, state: DenseMaps, primitive: int) -> jax.Array:
 
 
 def _along_yaw(
-    frames: Frames, state: DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array
+    frames: maps.Frames, state: maps.DenseMaps, primitive: int, xy: jax.Array, yaws: jax.Array
 ) -> jax.Array:
     """Interpolates logits [3] at a place [2] m and three yaws [3]; -inf where it is not valid.
 
@@ -64,15 +62,15 @@ def update(
 ) -> tuple[LearnerState, jax.Array]:
     """Updates theta^mu up the critic, Algorithm 1 lines 22-23; also returns the loss [], -J.
 
-    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map, for each
-    primitive that the policy takes. Without an actor nothing changes and the loss is 0.
+    grad J = mean grad_a Q(s, a)|_{a = mu(s)} grad mu(s), through the interpolated map. Without an
+    actor nothing changes and the loss is 0.
     """
     if not learner.cfg.learn.actor:
         return state, jnp.zeros(())
     frames, chosen = learner.frames, maps.allowed_primitives(learner.cfg.policy)
     q, features = jax.lax.stop_gradient(values.critic_maps(learner, state.online.critic, obs))
 
-    def value(_: jax.Array, single: DenseMaps) -> jax.Array:
+    def value(_: jax.Array, single: maps.DenseMaps) -> jax.Array:
         return maps.read(frames, single.q, jnp.int32(0), pose(frames, single, 0))
 
     def loss(learned: Any) -> tuple[jax.Array, Any]:

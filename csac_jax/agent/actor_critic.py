@@ -43,11 +43,6 @@ class ActorCritic:
     actor_optimiser: optax.GradientTransformation
     bounds: tuple[float, float]  # smallest and largest possible return
 
-    @property
-    def return_range(self) -> float:
-        """Returns the distance between the bounds."""
-        return self.bounds[1] - self.bounds[0]
-
 
 def make(cfg: Config, network: Any = None) -> ActorCritic:
     """Builds networks and optimisers of a config. `network` is a custom critic, see `networks`."""

@@ -1,4 +1,4 @@
-"""Augmentation of transitions: symmetries of the square workspace and shifts by whole cells.
+"""Augmentation of transitions by symmetries of the workspace and shifts by whole cells.
 
 Both are exact but for the light, which does not move along: sloping faces keep their brightness.
 """
@@ -38,11 +38,6 @@ def apply_symmetry(
     return transition.replace(obs=obs, next_obs=next_obs, action=action)
 
 
-def random_symmetry(key: jax.Array, transition: Transition) -> Transition:
-    """Applies one of the eight symmetries, each equally likely."""
-    return apply_symmetry(transition, *jax.random.bernoulli(key, shape=(3,)))
-
-
 def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
     """Shifts a transition by `cells` [2] int32 (row, col); cells that come in are bare table.
 
@@ -53,8 +48,10 @@ def shift(cfg: Config, transition: Transition, cells: jax.Array) -> Transition:
     step = cells[::-1].astype(jnp.float32) * cfg.heightmap.cell  # x, y
     new_pose = jnp.append(pose[:2] + step, pose[2])
     fits = _reaches(cfg, primitive, pose) & _reaches(cfg, primitive, new_pose)
+    place = geometry.cell_centres(cfg.heightmap) + step[None, None]
+    stays = jnp.all(jnp.abs(place) <= 0.5 * cfg.heightmap.extent, axis=-1)
     for obs in (transition.obs, transition.next_obs):
-        fits &= _stays(cfg, heightmap.unpack(obs).height, step)
+        fits &= jnp.all((heightmap.unpack(obs).height <= BARE) | stays)
     moved = transition.replace(
         obs=_shift_maps(transition.obs, cells),
         next_obs=_shift_maps(transition.next_obs, cells),
@@ -68,13 +65,6 @@ def _reaches(cfg: Config, primitive: jax.Array, pose: jax.Array) -> jax.Array:
     length = jnp.where(primitive == Primitive.PUSH, cfg.sim.push_length, 0.0)
     end = pose[:2] + length * jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2])])
     return jnp.all(jnp.maximum(jnp.abs(pose[:2]), jnp.abs(end)) <= 0.5 * cfg.heightmap.extent)
-
-
-def _stays(cfg: Config, height: jax.Array, step: jax.Array) -> jax.Array:
-    """Checks that all blocks of a map [H, W] m stay inside if shifted by `step` [2] m."""
-    place = geometry.cell_centres(cfg.heightmap) + step[None, None]
-    stays = jnp.all(jnp.abs(place) <= 0.5 * cfg.heightmap.extent, axis=-1)
-    return jnp.all((height <= BARE) | stays)
 
 
 def _shift_maps(obs: heightmap.PackedObservation, cells: jax.Array) -> heightmap.PackedObservation:
@@ -94,10 +84,10 @@ def _shift_maps(obs: heightmap.PackedObservation, cells: jax.Array) -> heightmap
 
 
 def augment(key: jax.Array, cfg: Config, transition: Transition) -> Transition:
-    """Applies the augmentation of the config."""
+    """Applies a random symmetry of the eight and a random shift, as the config says."""
     most = cfg.learn.augment_shift
     if cfg.learn.augment:
-        transition = random_symmetry(key, transition)
+        transition = apply_symmetry(transition, *jax.random.bernoulli(key, shape=(3,)))
     if most == 0:
         return transition
     _, key_cells = jax.random.split(jax.random.fold_in(key, 1))

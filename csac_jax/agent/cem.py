@@ -34,10 +34,8 @@ def maximise(
 
     mu' = mean(elites), sigma' = max(std(elites), std_min), elites = best K of J samples, lines
     8-12; numbers as QT-Opt, arXiv:1806.10293. Deviations from line 13: the result is the best
-    sample of all rounds, not the last mean, and the caller adds noise. NaN ranks last; `top_k`
-    would rank it first. Samples of value -inf are never elites.
-
-    Args: mean [3] the actor's proposal; start [P0, 3] first samples of the first round, P0 <= J.
+    sample of all rounds, and the caller adds noise. NaN and -inf are never elites. `mean` [3] is
+    the actor's proposal, `start` [P0, 3] the first samples of the first round, P0 <= J.
     """
     if len(start) > cfg.candidates:
         raise SettingsError(f"cem.candidates: must be at least {len(start)}, the starting points")
@@ -77,7 +75,7 @@ def fit(cfg: CEMConfig, elites: jax.Array, valid: jax.Array) -> tuple[jax.Array,
     """Fits mean [3] and std [3] of the `valid` [K] elites [K, 3], Algorithm 1 line 12.
 
     std: sqrt(1 / K sum (a_k - mu)^2), where line 12 has 1 / (K - 1) sum |a_k - mu|. Yaw is measured
-    from the first elite, the short way round: across the seam the mean is at the seam.
+    from the first elite, the short way round.
     """
     weight = valid.astype(elites.dtype)[:, None]  # [K, 1]
     count = jnp.maximum(jnp.sum(weight), 1.0)

@@ -31,9 +31,9 @@ def next_value(learner: ActorCritic, key: jax.Array, state: maps.DenseMaps) -> j
 def _softmax_value(learner: ActorCritic, key: jax.Array, state: maps.DenseMaps) -> jax.Array:
     """Estimates softmax_beta(Q'(s', .)) [] from noisy target actions, Algorithm 1 line 17.
 
-    Samples on empty table are ignored unless all are. beta is relative to `return_range` (ours).
+    Samples on empty table are ignored unless all are. beta is relative to the returns' range.
     """
-    cfg, frames = learner.cfg.target, learner.frames
+    cfg, frames, (lowest, highest) = learner.cfg.target, learner.frames, learner.bounds
 
     def sample(
         primitive: jax.Array, single: maps.DenseMaps
@@ -49,19 +49,16 @@ def _softmax_value(learner: ActorCritic, key: jax.Array, state: maps.DenseMaps) 
     q, valid, log_density = (leaf.reshape(-1) for leaf in samples)
     counted = valid | ~jnp.any(valid)
     return losses.softmax(
-        jnp.where(counted, q, learner.bounds[0]),
+        jnp.where(counted, q, lowest),
         jnp.where(counted, log_density, jnp.inf),
-        cfg.inverse_temperature / learner.return_range,
+        cfg.inverse_temperature / (highest - lowest),
     )
 
 
 def renewed_reward(
     learner: ActorCritic, params: Params, batch: Transition, next_maps: maps.DenseMaps
 ) -> jax.Array:
-    """Returns rewards [B] with eq. 16's label of pushes by `params`, or as stored without labels.
-
-    phi(s') is read from `next_maps`, of the same networks.
-    """
+    """Returns rewards [B] with eq. 16's label of pushes by `params`; as stored without labels."""
     if batch.push_better is None:
         return batch.reward
     cfg, pushed = learner.cfg.reward, batch.action.primitive == Primitive.PUSH

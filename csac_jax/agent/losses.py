@@ -15,10 +15,8 @@ from csac_jax.config import LearnConfig, TargetConfig
 def softmax(q: jax.Array, log_density: jax.Array, inverse_temperature: ArrayLike) -> jax.Array:
     """Estimates int exp(beta Q(a)) Q(a) da / int exp(beta Q(a)) da [] from samples, line 17.
 
-    As SD3 (arXiv:2010.09177): sum w_i q_i / sum w_i with w_i = exp(beta q_i) / p_i. Only distances
-    below the largest q are weighted: rounding cannot pass that q.
-
-    Args: q [N] finite values; log_density [N] log p of the samples; inverse_temperature [] beta.
+    As SD3 (arXiv:2010.09177): sum w_i q_i / sum w_i with w_i = exp(beta q_i) / p_i, of finite `q`
+    [N] and log p [N]. Only distances below the largest q are weighted: rounding cannot pass that q.
     """
     weight = jax.nn.softmax(inverse_temperature * q - log_density)  # no overflow
     top = jnp.max(q)

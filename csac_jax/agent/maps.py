@@ -1,7 +1,7 @@
 """Dense maps of one state: Q and actor logits for every primitive, yaw and cell.
 
-Map k stays in frame k, the workspace turned so that yaw_k points along +column. Q at a continuous
-action is trilinear: bilinear in the two frames next to its yaw, linear between them.
+Map k stays in frame k, the workspace turned so that yaw_k points along +column. Q at an action is
+bilinear in the two frames next to its yaw, linear between them.
 """
 
 import dataclasses
@@ -109,10 +109,7 @@ class DenseMaps:
 def map_primitives(
     call: Callable[[jax.Array, DenseMaps], Any], state: DenseMaps, chosen: Sequence[Primitive]
 ) -> Any:
-    """Calls `call(p, single)` for each primitive p of `chosen`: leaves [len(chosen), ...].
-
-    `single` holds the maps of p alone, as those of primitive 0. All share one trace.
-    """
+    """Calls `call(p, single)`, with the maps of p alone, for p of `chosen`: [len(chosen), ...]."""
     singles = jax.tree.map(lambda leaf: jnp.stack([leaf[p][None] for p in chosen]), state)
     return jax.vmap(call)(jnp.array(chosen, jnp.int32), singles)
 
@@ -142,9 +139,8 @@ def _all_frames(ahead: jax.Array, back: jax.Array) -> jax.Array:
 def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
-    Grasp: a surface above BARE under the cell, in the target task the target's. Push: one of any
-    block within the push's length ahead. With `policy.action_mask` none, every cell that the robot
-    reaches.
+    Grasp: a surface above BARE under the cell, in the target task the target's. Push: one within
+    its length ahead. With `policy.action_mask` none, every cell that the robot reaches.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
@@ -232,7 +228,7 @@ def cell_pose(frames: Frames, index: jax.Array) -> jax.Array:
 
 
 def cell_point(frames: Frames, index: jax.Array) -> jax.Array:
-    """Returns `cell_pose` as a point of the box [3]."""
+    """Returns `cell_pose` in the box, [3]."""
     return normalise(frames, cell_pose(frames, index))
 
 

@@ -34,15 +34,12 @@ def _best_poses(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.C
 
 
 def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResult:
-    """Maximises Q of primitive 0 over the pose by the cross-entropy method, lines 8-13.
-
-    Invalid poses cost the range of returns. The best cells, as many as elites, start the search.
-    """
-    cfg, frames = learner.cfg.cem, learner.frames
+    """Maximises Q of primitive 0 by the cross-entropy method, lines 8-13, from the best cells."""
+    cfg, frames, (lowest, highest) = learner.cfg.cem, learner.frames, learner.bounds
 
     def score(u: jax.Array) -> jax.Array:
         value, valid = maps.read_valid(frames, state, 0, maps.denormalise(frames, u))
-        return jnp.where(valid, value, value - learner.return_range)
+        return jnp.where(valid, value, value - (highest - lowest))  # below any that is valid
 
     cells = maps.best_cells(state.q[0], state.valid[0], cfg.elites)
     start = jax.vmap(maps.cell_point, (None, 0))(frames, cells)

@@ -55,8 +55,7 @@ def relabel(cfg: RewardConfig, reward: jax.Array, was: jax.Array, good: jax.Arra
 def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
     """Computes R = r + Gamma(phi) I [], eqs. 10-14: r = r2 - w r1, r1 the distance, r2 for a lift.
 
-    Deviation: the paper adds r1, which would reward staying away from the target. Ours: an action
-    that loses blocks costs `lost_block_penalty` once.
+    Deviation: the paper adds r1, which would reward distance. Ours: `lost_block_penalty`, once.
     """
     grasped = result.primitive == Primitive.GRASP
     grasp = scale(cfg, cfg.grasp_level) * grasp_effect(cfg, result.outcome)

@@ -19,10 +19,7 @@ _QUARTERS = 4  # parts of a batch that phi is computed for one after the other (
 def dense_maps(
     learner: ActorCritic, params: Params, obs: Observation, mirrored: bool = False
 ) -> maps.DenseMaps:
-    """Computes dense maps of states: `obs` leaves [B, ...], result leaves [B, P, K, h, w].
-
-    With `mirrored` Q is the mean over mirror images and critics.
-    """
+    """Computes dense maps [B, P, K, h, w] of states, leaves [B, ...]; see `critic_maps`."""
     q, features = critic_maps(learner, params.critic, obs, mirrored)
     correction: Any = jnp.zeros_like(q)
     if learner.cfg.learn.actor:
@@ -47,7 +44,8 @@ def critic_maps(
 ) -> tuple[jax.Array, Any]:
     """Computes the lower Q of both critics [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
 
-    Also returns the first critic's features [B, K / 2, ., ., F]. See `dense_maps` for `mirrored`.
+    With `mirrored` it is the mean over mirror images and critics. Also returns the first critic's
+    features [B, K / 2, ., ., F].
     """
     apply, join = (networks.apply_mirrored, jnp.mean) if mirrored else (networks.apply, jnp.min)
     frames = learner.frames
@@ -57,11 +55,8 @@ def critic_maps(
 
 
 def map_critics(call: Callable[[Any], Any], variables: Any) -> Any:
-    """Calls `call` with the variables of each critic, leaves [M, ...] in and out.
-
-    One after another: the grouped convolutions of a vmap take longer than both by themselves.
-    """
-    num = jax.tree.leaves(variables)[0].shape[0]
+    """Calls `call` with the variables of each critic, leaves [M, ...] in and out."""
+    num = jax.tree.leaves(variables)[0].shape[0]  # not by vmap: its grouped convolutions are slow
     results = [call(jax.tree.map(lambda leaf, m=m: leaf[m], variables)) for m in range(num)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
 
@@ -92,8 +87,8 @@ def best_grasps(
 ) -> jax.Array:
     """Computes phi_g [B] of the `wanted` [B] bool observations, leaves [B, ...]; else 0.
 
-    Wanted ones are moved to the front. Quarters of the batch pass through the networks, and one
-    without a wanted state costs nothing. Under vmap all do as many as the largest count asks.
+    Wanted ones are moved to the front, and only quarters of the batch with one pass through the
+    networks. Under vmap all do as many as the largest count asks.
     """
     num = wanted.shape[0]
     size = -(-num // _QUARTERS)

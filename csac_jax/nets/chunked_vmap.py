@@ -1,8 +1,4 @@
-"""Networks of several runs under `vmap`: in which form they work, and how many at a time.
-
-All DenseNet-121s at once need the memory of all and gain little. One by one, their many small
-products leave the device waiting.
-"""
+"""Networks of several runs under `vmap`: in which form they work, and how many at a time."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,7 +8,8 @@ import jax.numpy as jnp
 
 from csac_jax.config import Config, SmallNet
 
-_LARGEST = 5  # networks of DenseNet-121 in a chunk, ours: five seeds are one, 16 are four
+# DenseNet-121s in a chunk (ours): one by one they leave the device waiting, all need much memory.
+_LARGEST = 5
 
 
 class Batching(NamedTuple):

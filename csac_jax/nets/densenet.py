@@ -1,8 +1,7 @@
 """DenseNet-121 (arXiv:1608.06993, table 1) as the paper's network over rotated maps, CSAC sec. 3.4.
 
-Colour, height and, in the target task, the mask have a trunk each, with weights [T, ...]. Two 1 x 1
-convolutions turn their joined features into maps, which are upsampled. Modules have torchvision's
-names: its weights fit.
+Colour, height and, in the target task, the mask have a trunk each, with weights [T, ...]. Modules
+have torchvision's names: its weights fit.
 """
 
 import math
@@ -38,22 +37,15 @@ class Piece(NamedTuple):
 
 
 def _piece(maps: jax.Array) -> Piece:
-    """Computes the statistics of maps; both are saved for the gradient, see `Critic`.
-
-    The variance is E (x - E x)^2: E x^2 - (E x)^2 would cost a decimal in the last block.
-    """
-    axes = tuple(range(maps.ndim - 1))
-    exact = maps.astype(jnp.float32)
+    """Computes the statistics of maps; all are saved for the gradient, see `DenseNetCritic`."""
+    axes, exact = tuple(range(maps.ndim - 1)), maps.astype(jnp.float32)
     mean = jnp.mean(exact, axes, keepdims=True)
-    variance = jnp.mean(jnp.square(exact - mean), axes)
+    variance = jnp.mean(jnp.square(exact - mean), axes)  # E x^2 - (E x)^2 would cost a decimal
     return Piece(*(checkpoint_name(leaf, _SAVED) for leaf in (maps, mean.reshape(-1), variance)))
 
 
 class BatchNorm(nn.Module):
-    """Batch norm of maps [..., F] by the batch's mean and variance [F], or by the running ones.
-
-    Unlike Flax's it is given the batch's: layers of a block share the maps and their statistics.
-    """
+    """Batch norm of maps [..., F] by given mean and variance [F], or by the running ones."""
 
     dtype: Any
 
@@ -100,10 +92,7 @@ class DenseLayer(nn.Module):
 
 
 class DenseBlock(nn.Module):
-    """Dense layers, each on all pieces before it; returns all.
-
-    A norm joins the pieces that it reads: joined after every layer, all would be written again.
-    """
+    """Dense layers, each on all pieces before it; returns all, to be joined by the next norm."""
 
     cfg: DenseNet121
     layers: int
@@ -195,14 +184,11 @@ class DenseNetCritic(nn.Module):
 
 
 def _trunk_inputs(cfg: DenseNet121, maps: jax.Array) -> jax.Array:
-    """Splits maps [B, C, C, I] into colour and, three times each, the others: [T, B, z C, z C, 3].
-
-    z = upsample / 2, at least 1: a trunk doubles its cells itself. The barrier keeps XLA from
-    rotating the maps once per window.
-    """
+    """Splits maps [B, C, C, I] into colour and, three times, the others: [T, B, z C, z C, 3]."""
     inputs = [maps[..., :3]] if cfg.colour else []
     others = range(3 * len(inputs), maps.shape[-1])
     inputs += [jnp.repeat(maps[..., i : i + 1], 3, axis=-1) for i in others]
+    # The barrier keeps XLA from rotating the maps once per window.
     stacked = jax.lax.optimization_barrier(jnp.stack(inputs).astype(compute_dtype(cfg)))
-    upsample = max(cfg.upsample // 2, 1)
+    upsample = max(cfg.upsample // 2, 1)  # z: a trunk doubles its cells itself
     return jnp.repeat(jnp.repeat(stacked, upsample, axis=2), upsample, axis=3)

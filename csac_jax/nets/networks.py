@@ -1,9 +1,8 @@
 """The networks of a run, and their variables: parameters and running statistics of batch norm.
 
 A critic turns maps [N, C, C, I] into Q [N, h, w, OUTPUTS] and features; the actor's head turns the
-features into maps of Q's shape. With `train`, batch norm takes the batch's statistics. A custom
-critic is any Flax module of that signature with an attribute `stride`, C / h; its features have the
-cells of Q.
+features into maps of Q's shape. A custom critic is any Flax module of that signature with an
+attribute `stride`, C / h; its features have the cells of Q.
 """
 
 import dataclasses
@@ -70,8 +69,8 @@ class Networks:
     def states_at_once(self, canvas: int) -> int | None:
         """Returns the states, of canvas x canvas cells, in a call of the critic; None for any.
 
-        DenseNet-121 gets groups of the pixels of one state at 640 px (ours). All its calls then
-        consist of the same products, which XLA tunes once, and need the memory of one group.
+        DenseNet-121 gets the pixels of one state at 640 px: all its calls have the same products,
+        which XLA tunes once.
         """
         return max(1, round((_FULL / (self.upsample * canvas)) ** 2)) if self.upsample else None
 

@@ -1,7 +1,6 @@
-"""Convolutions and pools of DenseNet-121 as matrix products and shifted maps, for `vmap`.
+"""Convolutions and pools of DenseNet-121 as matrix products and shifted maps.
 
-Under `vmap` over trunks XLA's own convolutions become grouped ones, which are slow on GPUs and
-take minutes to tune.
+Under `vmap` over trunks XLA's own are grouped, slow on GPUs, and take minutes to tune.
 """
 
 import functools
@@ -36,8 +35,7 @@ class TapConvolution(nn.Module):
 class Stem(nn.Module):
     """The first convolution, of stride 2: [B, H, W, I] -> [B, H / 2, W / 2, features].
 
-    With `doubled` each cell of the maps stands for 2 x 2 pixels, which are not built: [B, H, W, I]
-    -> [B, H, W, features].
+    With `doubled` each cell of the maps stands for 2 x 2 pixels: -> [B, H, W, features].
     """
 
     features: int
@@ -62,8 +60,8 @@ class Stem(nn.Module):
 def max_pool(maps: jax.Array) -> jax.Array:
     """Computes the maximum over 3 x 3 cells, stride 2: [B, 2 H, 2 W, F] >= 0 -> [B, H, W, F].
 
-    The gradient goes to the first of the largest. It is written out: that of XLA's own window needs
-    an operation that GPUs lack in deterministic mode (flax issue 4233).
+    The gradient goes to the first of the largest. That of XLA's own window needs an operation that
+    GPUs lack in deterministic mode (flax issue 4233).
     """
     return functools.reduce(jnp.maximum, windows(maps, 3, 2))
 

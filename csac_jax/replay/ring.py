@@ -68,9 +68,8 @@ def gather(state: ReplayState, slots: jax.Array) -> Any:
 def set_priorities(state: ReplayState, slots: jax.Array, priorities: jax.Array) -> ReplayState:
     """Replaces the priorities of `slots` [B] int32, all filled, by `priorities` [B], at least 0.
 
-    A slot that occurs twice keeps the larger one: by `min` to 0 and `max`, as the order of
-    conflicting `set`s is undefined. A non-finite one counts as the largest that these slots have or
-    had.
+    A slot that occurs twice keeps the larger one: by `min` and `max`, as the order of `set`s is
+    undefined. A non-finite one counts as the largest that these slots have or had.
     """
     finite = jnp.isfinite(priorities)
     known = jnp.where(finite, jnp.minimum(priorities, LARGEST), 0.0)

@@ -83,11 +83,8 @@ def _pyramid(masses: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
 
 
 def _pick(masses: jax.Array, uniform: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Draws rows by the columns of `masses` [RADIX, num]; also returns the rest of `uniform` [num].
-
-    Sequential sums never fall, so that a row of no mass is never the first to exceed the goal. A
-    parallel `cumsum` does not promise it.
-    """
+    """Draws rows by the columns of `masses` [RADIX, num]; also returns the rest of `uniform`."""
+    # Sequential sums never fall: no row without mass is picked. `cumsum` does not promise it.
     reached = list(itertools.accumulate(masses))  # RADIX of [num]
     goal = uniform * reached[-1]
     row, below, above = jnp.zeros(goal.shape, jnp.int32), jnp.zeros_like(goal), reached[-1]
@@ -142,13 +139,12 @@ def opposite_slots(
 ) -> tuple[jax.Array, jax.Array]:
     """Draws for each of `slots` [B] one of its primitive and the opposite outcome, [B] bool if any.
 
-    Zeng et al., code: `main.py`, "experience replay". An outcome is good if its reward is positive.
-    The rank by priority follows Beta(a, b) within the transitions that match, rank 0 = largest.
+    As VPG's `main.py`, "experience replay": good if its reward is positive; the rank by priority
+    within the transitions that match follows Beta(a, b), rank 0 = largest.
     """
     key_rank, key_ties = jax.random.split(key)
     every = jnp.arange(state.priority.shape[0], dtype=jnp.int32)
-    good = (state.items.reward > 0.0).astype(jnp.int32)
-    kind = 2 * state.items.action.primitive + good
+    kind = 2 * state.items.action.primitive + (state.items.reward > 0.0).astype(jnp.int32)
     group = jnp.where(every < state.size, kind, jnp.int32(4))  # [C]
     ties = jax.random.bits(key_ties, every.shape)
     keys = (group, _descending(state.priority), ties, every)
@@ -241,10 +237,9 @@ class Beta(_Configured):
 
 
 class Opposite(_Configured):
-    """Half of a batch is new, the other half of opposite outcomes, of weight 0 without one.
+    """Half of a batch is new, the other half of opposite outcomes, of weight 0 without one; VPG.
 
-    VPG trains once on its newest transition and once on one drawn against it. Of larger batches the
-    first half is spread over the newest transitions, at least those of one step.
+    The first half is spread over the newest transitions, at least those of one step.
     """
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:

@@ -131,14 +131,11 @@ def _cells(frames: maps.Frames, poses: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _halves(frames: maps.Frames) -> np.ndarray:
-    shape = (frames.yaws.size // 2, frames.side, frames.side, dense.OUTPUTS)
-    return np.random.default_rng(0).normal(size=shape).astype(np.float32)
-
-
 def test_unfolding(frames):
     """Claim: frame k + K / 2 is frame k upside down, and pushes with the map of push back."""
-    halves, half = _halves(frames), frames.yaws.size // 2
+    half = frames.yaws.size // 2
+    shape = (half, frames.side, frames.side, dense.OUTPUTS)
+    halves = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     all_yaws = np.asarray(maps.unfold(jnp.asarray(halves)))
     ahead, back, grasp = np.moveaxis(halves, -1, 0)
     assert_array_equal(all_yaws[PUSH], np.concatenate([ahead, back[:, ::-1, ::-1]]))

@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from csac_jax.agent import actor_critic, critic, rewards, values
+from csac_jax.agent import actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.learner import Transition
-from csac_jax.config import RewardConfig
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
 from csac_jax.robot.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision import heightmap
-from tests.agent import test_rewards
 
 pytestmark = pytest.mark.optax
 B = 6
@@ -85,15 +83,13 @@ def test_early_label_is_renewed(renewing, observations):
 
 
 def test_stored_label_stays_as_an_option(cfg, observations):
-    """Claim: by `push_label` value the reward is the stored one, and no label is."""
+    """Claim: by `push_label` stored the reward is the stored one, and no label is."""
     learner = actor_critic.make(cfg, Height())
     batch = _batch(observations, False, -0.5).replace(push_better=None)
     assert_array_equal(_renewed(learner, jnp.float32(1.0), batch), batch.reward)
     assert programs.example(learner.cfg).push_better is None
-    assert (
-        programs.example(cfg.change(reward={"push_label": "current_critic"})).push_better.dtype
-        == bool
-    )
+    renewing = cfg.change(reward={"push_label": "current_critic"})
+    assert programs.example(renewing).push_better.dtype == bool
 
 
 @pytest.mark.parametrize("num", [1, 5])
@@ -129,13 +125,3 @@ def test_replicas_ask_for_the_neediests_quarters(learner, randomised, observatio
     jax.effects_barrier()
     assert_allclose(got, np.where(wanted, phi, 0.0), rtol=1e-4, atol=1e-5)
     assert len(passed) == 2
-
-
-def test_relabelling_is_the_difference_of_two_rewards():
-    """Claim: a renewed reward is what the action would have earned with the new label."""
-    cfg, no = RewardConfig(lost_block_penalty=3.0), jnp.array(False)
-    worse, better = (
-        test_rewards.reward(cfg, Primitive.PUSH, after=gain, blocks_lost=1) for gain in (0.0, 1.0)
-    )
-    assert rewards.relabel(cfg, jnp.float32(worse), no, ~no) == better != worse
-    assert rewards.relabel(cfg, jnp.float32(better), ~no, no) == worse
