@@ -243,8 +243,8 @@ def match_networks(cfg: Config, source: str | Path) -> Config:
 
 def new_folder(name: str) -> Path:
     """Returns a folder under RUNS, with the time in its name, that does not exist yet."""
-    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
+    stem = f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    candidates = (RUNS / f"{stem}{end}" for end in ("", *(f"-{i}" for i in range(2, 100))))
     return next(path for path in candidates if not path.exists())
 
 
@@ -259,10 +259,10 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[grid.SweepPoint
         grid.kind_of(name)
 
     def configure(values: dict[str, Any]) -> Config:
+        base = algorithms.configure(cfg, values.pop("algo")) if "algo" in values else cfg
         settings: dict[str, Any] = {}
         for name, value in values.items():
-            settings |= {} if name == "algo" else grid.settings_of(name, value)
-        base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
+            settings |= grid.settings_of(name, value)
         return programs.replace_settings(base, settings)
 
     return grid.combine(vary, configure)

@@ -135,7 +135,7 @@ def _parts(table: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def read_plan(run_dir: Path) -> EvalPlan | None:
-    """Reads the evaluation plan of a run; None if it has none. Raises SettingsError."""
+    """Reads a run's plan; None if it has none. Raises SettingsError."""
     if not (path := run_dir / PLAN).exists():
         return None
     try:
