@@ -23,8 +23,8 @@ from csac_jax.runtime import cache, cluster, provenance, signals
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import callbacks as followers, loop, memory, programs, sharding, split_step
-from csac_jax.training.callbacks import Callback, Record, Summary
+from csac_jax.training import loop, memory, programs, sharding, split_step
+from csac_jax.training.callbacks import Callback, FunctionCallback, Record, Summary
 from csac_jax.training.progress import Terminal
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -94,11 +94,10 @@ def train(
         terminal.log(_first_line(folder, cfg))
         program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
         cached = (learner, sampler, network) == (None, None, None)
-        follower = followers.joined(callbacks)
+        called = [one if isinstance(one, Callback) else FunctionCallback(one) for one in callbacks]
         if plan is not None:
             policy = lambda state: policies.policy_from_state(cfg, state, network, learner)  # noqa: E731
-            watch = monitor.Monitor(cfg, plan, policy, follower, terminal.log)
-            follower = followers.joined([follower, watch])
+            called.append(monitor.Monitor(cfg, plan, policy, called[:], terminal.log))
         begin = programs.compile_init(program)
 
         def first_state() -> TrainState:
@@ -109,7 +108,7 @@ def train(
         compile_chunk = functools.partial(split_step.compile_chunk, program, cached=cached)
         stop = stop or signals.Stop()
         summary = loop.run(
-            cfg, folder, first_state, compile_chunk, terminal, stop, resume, at, follower
+            cfg, folder, first_state, compile_chunk, terminal, stop, resume, at, called
         )
     return Run(folder, cfg, summary, {"network": network, "learner": learner})
 
@@ -243,8 +242,8 @@ def match_networks(cfg: Config, source: str | Path) -> Config:
 
 def new_folder(name: str) -> Path:
     """Returns a folder under RUNS, with the time in its name, that does not exist yet."""
-    stem = RUNS / f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-    candidates = [stem, *(stem.with_name(f"{stem.name}-{i}") for i in range(2, 100))]
+    stem = f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+    candidates = (RUNS / f"{stem}{end}" for end in ("", *(f"-{i}" for i in range(2, 100))))
     return next(path for path in candidates if not path.exists())
 
 
@@ -259,10 +258,10 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[grid.SweepPoint
         grid.kind_of(name)
 
     def configure(values: dict[str, Any]) -> Config:
+        base = algorithms.configure(cfg, values.pop("algo")) if "algo" in values else cfg
         settings: dict[str, Any] = {}
         for name, value in values.items():
-            settings |= {} if name == "algo" else grid.settings_of(name, value)
-        base = algorithms.configure(cfg, values["algo"]) if "algo" in values else cfg
+            settings |= grid.settings_of(name, value)
         return programs.replace_settings(base, settings)
 
     return grid.combine(vary, configure)

@@ -39,12 +39,10 @@ def test_public_names_exist():
 
 def test_import_leaves_jax_alone():
     """Claim: `import csac_jax` loads neither JAX nor MuJoCo, and `--help` neither."""
+    loaded = "import sys; print({'jax', 'mujoco', 'flax'} & set(sys.modules))"
     for code in ("import csac_jax", "from csac_jax import cli; cli.main(['--help'])"):
-        loaded = "import sys; print({'jax', 'mujoco', 'flax'} & set(sys.modules))"
-        out = subprocess.run(
-            [sys.executable, "-c", f"{code}; {loaded}"], check=True, capture_output=True, text=True
-        )
-        assert out.stdout.strip().endswith("set()")
+        command = [sys.executable, "-c", f"{code}; {loaded}"]
+        assert subprocess.check_output(command, text=True).strip().endswith("set()")
 
 
 def _learner_state(cfg: Config, seed: int = 0) -> LearnerState:

@@ -9,7 +9,7 @@ Evaluations have their own keys and programs: they do not change what is trained
 import json
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -51,17 +51,17 @@ class Monitor(Callback):
         cfg: Config,
         plan: EvalPlan,
         make_policy: Callable[[Any], Policy],
-        callback: Callback,
+        callbacks: Sequence[Callback],
         log: Callable[[str], None],
     ) -> None:
         """Settles the scenes. Raises SettingsError for a suite that does not fit the policy.
 
-        Args: make_policy, of a learner's state; callback, whose `evaluated` is called; log, takes a
-        line about each evaluation.
+        Args: make_policy, of a learner's state; callbacks, whose `evaluated` is called; log, takes
+        a line about each evaluation.
         """
         self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
         self._cfg, self._plan, self._policy = cfg, plan, make_policy
-        self._callback, self._log = callback, log
+        self._callbacks, self._log = callbacks, log
         self._best: Score = ()
         self._done = 0  # actions before the chunk that comes next
 
@@ -91,7 +91,8 @@ class Monitor(Callback):
         values = [f"{name} {value:.1%}" for name, value in zip(JUDGED, score, strict=True)]
         line = f"evaluated on {self._plan.suite} at {record.actions} actions: {', '.join(values)}"
         self._log(line.replace("_", " ") + ", the best so far" * best)
-        self._callback.evaluated(record, table)
+        for callback in self._callbacks:
+            callback.evaluated(record, table)
 
     def _write(
         self, record: Record, seconds: float, score: Score, best: bool, table: dict[str, Any]
@@ -135,7 +136,7 @@ def _parts(table: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def read_plan(run_dir: Path) -> EvalPlan | None:
-    """Reads the evaluation plan of a run; None if it has none. Raises SettingsError."""
+    """Reads a run's plan; None if it has none. Raises SettingsError."""
     if not (path := run_dir / PLAN).exists():
         return None
     try:

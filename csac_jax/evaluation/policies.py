@@ -170,8 +170,7 @@ def in_world(policy: Policy, cfg: Config) -> Policy:
 
 def load_config(source: str | Path, which: Which = "last") -> Config:
     """Reads the config of a policy; see `load`."""
-    path = policy_file.find(source)
-    if path.is_file():
+    if (path := policy_file.find(source)).is_file():
         return policy_file.load(path)[0]
     return checkpoint.load_config(*_checkpoint(path, which))
 
@@ -185,8 +184,7 @@ def load(
     checkpoint: `last`, the newest sound one; `best` of the evaluations on the way; or a step.
     Raises FileNotFoundError, PolicyFileError or CheckpointError, with the remedy.
     """
-    path = policy_file.find(source)
-    if path.is_file():
+    if (path := policy_file.find(source)).is_file():
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)

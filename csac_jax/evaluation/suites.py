@@ -213,8 +213,7 @@ def _cases(cfg: Config, *_: int) -> dict[str, Env]:
 
 def _target(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
     cfg = cfg.change(task=TARGET)
-    ten = _ten(cfg, episodes, stream)  # which allows more actions
-    return {**_cases(cfg), "random10": dataclasses.replace(ten, cfg=ten.cfg.change(task=TARGET))}
+    return {**_cases(cfg), "random10": _as_target(_ten(cfg, episodes, stream))}
 
 
 def _packed(cfg: Config, episodes: int, stream: int) -> Env:
@@ -244,9 +243,8 @@ def _objects10(cfg: Config, episodes: int, stream: int) -> Env:
     return _env(cfg, pool.settled(cfg, stream, episodes))
 
 
-def _target_objects(cfg: Config, episodes: int, stream: int) -> Env:
-    ten = _objects10(cfg, episodes, stream)
-    return dataclasses.replace(ten, cfg=ten.cfg.change(task=TARGET))
+def _as_target(env: Env) -> Env:
+    return dataclasses.replace(env, cfg=env.cfg.change(task=TARGET))
 
 
 def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
@@ -278,4 +276,4 @@ register("camera", _camera)
 register("pile", _pile, 1000, objects=True)
 register("objects_packed", _objects_packed, 1000, objects=True)
 register("objects10", _objects10, 500, objects=True)
-register("target_objects", _target_objects, 500, target=True, objects=True)
+register("target_objects", lambda *of: _as_target(_objects10(*of)), 500, target=True, objects=True)

@@ -58,30 +58,15 @@ _Version = _struct("Version", **_HEAD, major=c_int, minor=c_int)
 _Metadata = _struct("Metadata", struct_size=c_size_t, version=_Version, traits=c_uint32)
 _Buffer = _struct("Buffer", **_HEAD, type=c_int, data=c_void_p, rank=c_int64, dims=POINTER(c_int64))
 _Text = _struct("Text", start=c_void_p, length=c_size_t)
-_Buffers = _struct(
-    "Buffers", **_HEAD, size=c_int64, types=POINTER(c_int), values=POINTER(POINTER(_Buffer))
-)
-_Attributes = _struct(
-    "Attributes",
-    **_HEAD,
-    size=c_int64,
-    types=POINTER(c_int),
-    names=POINTER(POINTER(_Text)),
-    values=POINTER(POINTER(_Text)),
-)
+_LIST: dict[str, Any] = {"size": c_int64, "types": POINTER(c_int)}
+_TEXTS = POINTER(POINTER(_Text))
+_Buffers = _struct("Buffers", **_HEAD, **_LIST, values=POINTER(POINTER(_Buffer)))
+_Attributes = _struct("Attributes", **_HEAD, **_LIST, names=_TEXTS, values=_TEXTS)
 _Error = _struct("Error", **_HEAD, message=c_char_p, code=c_int)
 _MakeError = ctypes.CFUNCTYPE(c_void_p, POINTER(_Error))
 _Api = _struct("Api", **_HEAD, version=_Version, internal=c_void_p, make_error=_MakeError)
-_Frame = _struct(
-    "Frame",
-    **_HEAD,
-    api=POINTER(_Api),
-    context=c_void_p,
-    stage=c_int,
-    arguments=_Buffers,
-    results=_Buffers,
-    attributes=_Attributes,
-)
+_PARTS = {"arguments": _Buffers, "results": _Buffers, "attributes": _Attributes}
+_Frame = _struct("Frame", **_HEAD, api=POINTER(_Api), context=c_void_p, stage=c_int, **_PARTS)
 
 
 @ctypes.CFUNCTYPE(c_void_p, POINTER(_Frame))

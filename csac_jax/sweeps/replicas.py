@@ -124,11 +124,10 @@ class SweepProgram:
         """
         mesh, replicas, program = self.mesh, self.replicas, self.program
         vmapped = len(replicas.seed) // (self.parts if mesh is None else mesh.size)
-        if mesh is not None and self.shard == "scenes":
-            program = dataclasses.replace(program, mesh=mesh)
         assert isinstance(program.learner, CSAC)
         learner = program.learner.batched(self._batching(vmapped))
-        program = dataclasses.replace(program, learner=learner)
+        by_scenes = mesh if self.shard == "scenes" else None
+        program = dataclasses.replace(program, learner=learner, mesh=by_scenes)
 
         def train_one(replica: Replicas, state: TrainState) -> tuple[TrainState, StepMetrics]:
             traced = programs.replace_hyperparams(program, replica.hyperparams)

@@ -2,12 +2,12 @@
 
 SWEEP/sweep.json                the plan; a sweep is resumed from it
 SWEEP/summary.json              grasp success of every point over its seeds, and of every run
-SWEEP/POINT/seed-K/             a run, laid out like one of `train`; its checkpoint comes at the end
+SWEEP/POINT/seed-K/             a run of one point with one seed, laid out like one of `train`
 SWEEP/POINT/seed-K/eval.json    evaluation of its final policy, where the plan has `episodes`
 SWEEP/groups/I/checkpoints/     the state of all runs of group I, until they are done
 SWEEP/groups/I/done             their checkpoints are written
 
-A run is one point with one seed. One whose loss is not finite ends; the others continue.
+A run whose loss is not finite ends; the others continue.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
 
 
 class SweepError(FailedError):
-    """A sweep that cannot begin or continue; the message is one line with the remedy."""
+    """A sweep that cannot begin or continue."""
 
 
 class SweepPlan(NamedTuple):

@@ -1,7 +1,7 @@
 """Callbacks of a run: trackers, evaluations during training, functions of your own."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,40 +73,11 @@ class Callback:
         """Runs after the last chunk; no summary if the run has failed."""
 
 
-def joined(callbacks: Sequence[Callback | Callable[[Record], None]]) -> Callback:
-    """Joins callbacks into one, called in order; functions are called with each chunk's record."""
-    return _Joined(
-        [call if isinstance(call, Callback) else _FunctionCallback(call) for call in callbacks]
-    )
-
-
 @dataclasses.dataclass
-class _FunctionCallback(Callback):
+class FunctionCallback(Callback):
+    """A function that is called with each chunk's record."""
+
     call: Callable[[Record], None]
 
     def chunk(self, record: Record, state: Any) -> None:
         self.call(record)
-
-
-@dataclasses.dataclass
-class _Joined(Callback):
-    callbacks: Sequence[Callback]
-
-    def begin(self, run: RunInfo) -> None:
-        for callback in self.callbacks:
-            callback.begin(run)
-
-    def chunk(self, record: Record, state: Any) -> None:
-        for callback in self.callbacks:
-            callback.chunk(record, state)
-
-    def evaluated(self, record: Record, table: dict[str, Any]) -> None:
-        for callback in self.callbacks:
-            callback.evaluated(record, table)
-
-    def end(self, summary: Summary | None) -> None:
-        for callback in self.callbacks:
-            callback.end(summary)
-
-
-SILENT = Callback()  # does nothing

@@ -20,7 +20,7 @@ from csac_jax.io import checkpoint, configs, files, lock
 from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
-from csac_jax.training.callbacks import SILENT, Callback, Record, RunInfo, Summary
+from csac_jax.training.callbacks import Callback, Record, RunInfo, Summary
 from csac_jax.training.transitions import LOSSES
 
 SUMS = (
@@ -31,7 +31,7 @@ DIVERGED_SHARE = 1e-3  # of a chunk's actions: more diverged physics is logged; 
 
 
 class TrainingError(FailedError):
-    """A run that cannot continue; the message is one line with the remedy."""
+    """A run that cannot continue."""
 
 
 class Reporter(Protocol):
@@ -75,7 +75,7 @@ def run(
     stop: Stop,
     resume: bool = False,
     at: int | None = None,
-    callback: Callback = SILENT,
+    callbacks: Sequence[Callback] = (),
 ) -> Summary:
     """Trains until the config's actions are done or `stop.signal` is set; saves in both cases.
 
@@ -92,13 +92,15 @@ def run(
         if resume:
             actions = start.step * cfg.train.scenes
             reporter.log(f"resumed {run_dir} at step {start.step} ({actions} actions)")
-        callback.begin(RunInfo(cfg, run_dir, start.step))
+        for callback in callbacks:
+            callback.begin(RunInfo(cfg, run_dir, start.step))
         summary = None
         try:
-            summary = _train(cfg, run_dir, start, compile_chunk, reporter, stop, callback)
+            summary = _train(cfg, run_dir, start, compile_chunk, reporter, stop, callbacks)
             return summary
         finally:
-            callback.end(summary)
+            for callback in callbacks:
+                callback.end(summary)
 
 
 def _train(
@@ -108,7 +110,7 @@ def _train(
     compile_chunk: Callable[[int], Any],
     reporter: Reporter,
     stop: Stop,
-    callback: Callback,
+    callbacks: Sequence[Callback],
 ) -> Summary:
     step, loop_state, saved = start.step, start.loop_state, start.saved
     total, scenes = total_steps(cfg), cfg.train.scenes
@@ -134,7 +136,8 @@ def _train(
         if step % (cfg.train.save_every * cfg.train.chunk) == 0:
             checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())
             saved = step
-        callback.chunk(record, state)
+        for callback in callbacks:
+            callback.chunk(record, state)
     if saved != step:
         state = start.state.result() if chunk is None else state
         checkpoint.save(run_dir, step, state, cfg, loop_state._asdict())

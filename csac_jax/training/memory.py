@@ -23,12 +23,9 @@ def limit() -> int:
 def state_bytes(cfg: Config) -> dict[str, int]:
     """Returns the bytes of a run's state by part; tracing the networks takes seconds."""
     state = programs.abstract_state(cfg)
+    size = lambda leaf: math.prod(leaf.shape) * leaf.dtype.itemsize  # noqa: E731
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
-
-    def size(part: Any) -> int:
-        return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(part))
-
-    return {name: size(part) for name, part in parts.items()}
+    return {name: sum(map(size, jax.tree.leaves(part))) for name, part in parts.items()}
 
 
 def check(cfg: Config, runs: int = 1) -> None:

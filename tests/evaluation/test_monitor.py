@@ -19,7 +19,7 @@ from csac_jax.evaluation.monitor import EvalPlan, Monitor
 from csac_jax.io import checkpoint
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
-from csac_jax.training import callbacks, loop
+from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo, Summary
 from tests.metrics import step_metrics
 
@@ -98,11 +98,10 @@ def _run(
     folder: Path, notes: Notes, *others: Callback, every: int = 64, cfg: Config = CFG, **more: Any
 ) -> Summary:
     """A run of the tiny program, evaluated if `every`."""
-    watched = (
-        [Monitor(cfg, EvalPlan(every), lambda state: state, notes, notes.log)] if every else []
-    )
-    joined = callbacks.joined([notes, *watched, *others])
-    return loop.run(cfg, folder, _first, _chunk, notes, notes.stop, callback=joined, **more)
+    called = [notes, *others]
+    if every:
+        called.append(Monitor(cfg, EvalPlan(every), lambda state: state, [notes], notes.log))
+    return loop.run(cfg, folder, _first, _chunk, notes, notes.stop, callbacks=called, **more)
 
 
 def _log(path: Path) -> list[dict[str, Any]]:

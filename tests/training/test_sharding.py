@@ -76,10 +76,7 @@ def test_what_cannot_be_divided():
     sharding.check(Three(), "seeds", 6, 8, 8)
     sharding.check(Three(), "scenes", 1, 6, 9)
     sharding.check(None, "scenes", 1, 7, 5)
-    for arguments, name in (
-        (("seeds", 8, 6, 9), "seeds: 8"),
-        (("scenes", 6, 8, 9), "train.scenes: 8"),
-        (("scenes", 6, 6, 8), r"learn\.batch: 8"),
-    ):
-        with pytest.raises(SettingsError, match=name):
-            sharding.check(Three(), *arguments)
+    numbers = {"seeds": (8, 6, 9), "train.scenes": (6, 8, 9), "learn.batch": (6, 6, 8)}
+    for name, counts in numbers.items():
+        with pytest.raises(SettingsError, match=f"{name}: 8"):
+            sharding.check(Three(), "seeds" if name == "seeds" else "scenes", *counts)
