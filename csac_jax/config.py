@@ -27,8 +27,7 @@ class SceneConfig(Section, section="scene"):
     slots: tuple[SlotKind, ...] = ("box", "box", "prism", "box", "cylinder")
     """Kind of each slot. A box slot draws a cube, cuboid, plank or tile in every scene."""
     objects: str = ""
-    """Library that slots of kind object draw from: a folder; or shapes of this package,
-    procedural:SEED:COUNT; or procedural+assemblies:SEED:COUNT with random assemblies among them."""
+    """Library for slots of kind object: a folder, or procedural[+assemblies]:SEED:COUNT."""
     split: Literal["train", "held_out", "all"] = "train"
     """Objects of the library to draw: those for training, those kept for evaluation, or all."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
@@ -64,8 +63,7 @@ class TaskConfig(Section, section="task"):
 
     max_steps_without_change: ClassVar[int] = 10  # actions without visible change that end it (VPG)
     kind: Literal["clear", "target"] = "clear"
-    """`clear`: take every block (CSAC sec. 4.2). `target`: get one block, marked at random, then
-    the next, and another scene when no block is left (sec. 4.3)."""
+    """`clear`: take every block (CSAC sec. 4.2). `target`: get the marked one, again and again."""
     max_actions: int = number(15, 1)  # Actions after which an episode is cut off.
 
 
@@ -79,7 +77,6 @@ class SimConfig(Section, section="sim"):
     grasp_depth: ClassVar[float] = 0.035  # m, of the finger tips below the surface (VPG: 0.03-0.04)
     push_length: ClassVar[float] = 0.10  # m (VPG)
     push_depth: ClassVar[float] = 0.02  # m, of the tips below the local top (ours)
-
     physics: PhysicsKind = "mjx"
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
@@ -143,9 +140,8 @@ class CameraConfig(Section, section="camera"):
 class SensorConfig(Section, section="sensor"):
     """Errors of a real depth camera: those of its `kind`, and the others added to them.
 
-    Depth errors: sigma = floor + square d^2. Khoshelham and Elberink (Sensors 12, 2012, 1437-1454)
-    measured a square of 0.0014 for a structured-light camera. Sigma is a standard deviation. All
-    but depths and dropped pixels are drawn once a view.
+    Depth errors: sigma = floor + square d^2; a structured-light camera has a square of 0.0014
+    (Khoshelham and Elberink, Sensors 12, 2012). All but errors of pixels are drawn once a view.
     """
 
     kind: SensorKind = "none"  # Camera to imitate, oblique view; see vision/depth_camera.py.
@@ -221,7 +217,6 @@ class DenseNet121(_AnyNet):
     gripper: ClassVar[bool] = False  # no trunk sees the gripper
     STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
     output_stride: ClassVar[int] = 4  # map cells per output cell (ours; paper: 1, 16 x the memory)
-
     kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
@@ -255,7 +250,6 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-
     candidates: int = number(64, 1)  # J, actions sampled in a round.
     elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
     rounds: int = number(3, 1)  # Rounds of sampling and fitting.
@@ -289,7 +283,6 @@ class TargetConfig(Section, section="target"):
     std: ClassVar[float] = 0.2  # of the noise of target actions, in CEM's units (SD3)
     clip: ClassVar[float] = 0.5  # bound of that noise (SD3)
     samples: ClassVar[int] = 50  # noisy target actions per primitive in the softmax (SD3)
-
     value: Literal["softmax", "max"] = "softmax"  # V(s'): softmax (line 17) or maximum (eq. 9).
     gamma: float = number(0.5, 0.0, 1.0)  # Discount (VPG).
     bootstrap: Literal["episodic", "continuing"] = "episodic"
@@ -309,7 +302,6 @@ class RewardConfig(Section, section="reward"):
     push_level: ClassVar[float] = 0.0  # s_c of eq. 13
     grasp_level: ClassVar[float] = 1.0  # s_g of eq. 13, which is s_max
     eta: ClassVar[Pair] = (0.0, 1.0)  # eta_0, eta_1 of eq. 13, without numbers there
-
     success_bonus: float = 1.0  # r2 of eq. 11: the hand comes back with a block.
     grasp_levels: tuple[float, float, float, float, float] = (-1.0, -0.5, -0.25, 0.0, 1.0)
     """I_g of eq. 15: nothing met, closed on air, block touched, block dropped, block lifted."""
@@ -319,8 +311,7 @@ class RewardConfig(Section, section="reward"):
     push_levels: Pair = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = number(0.0, 0.0)  # For a block that leaves the workspace (ours).
     outcome_source: Literal["simulator", "sensors"] = "simulator"
-    """Source of a grasp's outcome: the simulator's contacts and poses; or the finger gap and the
-    change of the height map, as on a robot (sec. 3.3). A push is judged by maps in any case."""
+    """Judge of grasps: the simulator's contacts and poses; or finger gap and maps (sec. 3.3)."""
 
     @property
     def relabels(self) -> bool:
@@ -352,7 +343,6 @@ class LearnConfig(Section, section="learn"):
 
     gradient_clip: ClassVar[float] = 10.0  # bound of the gradient's global norm (ours)
     huber: ClassVar[float] = 1.0  # width of the quadratic part of the Huber loss (CSAC sec. 4)
-
     learning_rate: float = number(1e-3, 0.0, above=True)  # Adam's step size, critic (VPG 1e-4).
     actor_learning_rate: float = number(3e-4, 0.0, above=True)  # Adam's step size, actor (ours).
     lr_final_fraction: float = number(0.05, 0.0, 1.0, above=True)
@@ -468,7 +458,6 @@ class Config(Section):
         return _replaced(self, values)
 
     def check(self) -> None:
-        """Raises SettingsError for sections that do not fit one another."""
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
         require(may_push, "explore.push_fraction: must be 0 where policy.primitive is grasp")
         episodic = not self.reward.relabels or self.target.bootstrap == "episodic"

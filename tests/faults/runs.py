@@ -471,7 +471,7 @@ def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
 def nan_in_training(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Spoils replay or learner of the real step: NaN in the networks is reported at once."""
     cfg = presets.smoke().change(
-        sim={"physics": "c"}, replay={"capacity": 16}, train={"scenes": 8, "learning_starts": 8}
+        sim={"physics": "c"}, replay={"capacity": 64}, train={"scenes": 8, "learning_starts": 8}
     )
     program = programs.make(cfg)
     start = programs.init(program)
@@ -497,7 +497,7 @@ def _finite(leaf: jax.Array) -> bool:
 def _poisoned(rng: Rng, state: step.TrainState, kind: str) -> step.TrainState:
     if kind == "reward":
         items = state.replay.items
-        items = items.replace(reward=items.reward.at[int(rng.integers(8))].set(jnp.nan))
+        items = items.replace(reward=items.reward.at[int(rng.integers(8)) :].set(jnp.nan))
         return state.replace(replay=state.replay.replace(items=items))
     # Adam's moments keep what a gradient was
     part = "critic_optimiser" if kind == "gradient" else str(rng.choice(["online", "target"]))
