@@ -26,9 +26,10 @@ MAIN = {
     "parity": ["--primitives", "64", "--poses", "8"],
 }
 """Benchmark -> its arguments."""
+PARTS = ("first_action", "first_action_cached", "success", "end")  # of `start`
 FIGURES = {
     "step": ("actions_per_second", "step_seconds", "compile_seconds.cached.compile"),
-    "start": ("median.this.first_action", "median.this.first_action_cached", "median.this.end"),
+    "start": tuple(f"median.this.{part}" for part in PARTS),
     "learner": ("peak_gflop_per_second", "parts.forward.share_of_peak"),
     "act": ("densenet121.0.seconds_per_state", "small.quick.times.0.seconds_per_state"),
     "replay": ("capacities.0.median_seconds.beta", "capacities.4.median_seconds.beta"),
