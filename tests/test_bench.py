@@ -1,5 +1,8 @@
 """The benchmarks' own arithmetic."""
 
+import contextlib
+import json
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.errors import SettingsError
 from csac_jax.nets import dense
+from experiments import index
 from experiments.bench import __main__ as page, learner, step_kernels
 
 
@@ -43,3 +47,14 @@ def test_page_shows_figures_and_failures():
     (row,) = page.rows("sweep", {"failed": "no room", "wall_seconds": 2})
     assert row == {"benchmark": "sweep", "figure": "failed", "value": "no room"}
     assert page.FIGURES.keys() == page.MAIN.keys()
+
+
+def test_page_reads_what_benchmarks_write():
+    """Claim: the main figures of the page are those of a recorded result of each benchmark."""
+    for name, places in page.FIGURES.items():
+        records = json.loads((index.RESULTS / "bench" / f"{name}.json").read_text())
+        shown = []
+        for record in records.values():
+            with contextlib.suppress(KeyError, IndexError):
+                shown.append(page.rows(name, {"wall_seconds": 1, **record}))
+        assert any(len(rows) == 1 + len(places) for rows in shown), name

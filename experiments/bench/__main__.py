@@ -26,9 +26,10 @@ MAIN = {
     "parity": ["--primitives", "64", "--poses", "8"],
 }
 """Benchmark -> its arguments."""
+PARTS = ("first_action", "first_action_cached", "success", "end")  # of `start`
 FIGURES = {
     "step": ("actions_per_second", "step_seconds", "compile_seconds.cached.compile"),
-    "start": ("median.first_action", "median.first_action_cached", "median.success", "median.end"),
+    "start": tuple(f"median.this.{part}" for part in PARTS),
     "learner": ("peak_gflop_per_second", "parts.forward.share_of_peak"),
     "act": ("densenet121.0.seconds_per_state", "small.quick.times.0.seconds_per_state"),
     "replay": ("capacities.0.median_seconds.beta", "capacities.4.median_seconds.beta"),
@@ -67,10 +68,10 @@ def main(names: list[str]) -> int:
     """Measures these benchmarks, by default all; returns the number that failed."""
     found = {name: measure(name, MAIN[name]) for name in names or MAIN}
     record = provenance.record()
+    files.write_json(BUILD / "bench.json", {**record, "benchmarks": found})
     table = [row for name, result in found.items() for row in rows(name, result)]
     head = f"# Benchmarks\n\n{record['device']}, commit {record['commit']}\n\n"
     files.replace(BUILD / "bench.md", f"{head}{result_tables.table_text(table)}\n")
-    files.write_json(BUILD / "bench.json", {**record, "benchmarks": found})
     print(BUILD / "bench.md")
     return sum("failed" in result for result in found.values())
 

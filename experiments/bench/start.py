@@ -41,14 +41,13 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--other", type=Path)
     parser.add_argument("--cores", type=int)
     preset, options, flags = _options.split(parser, list(arguments))
-    train = [preset, *flags]
     checkouts = {"this": HERE}
     if options.other is not None:
         if not (options.other / "csac_jax").is_dir():
             raise SettingsError(f"bench start: --other: {options.other} is no checkout")
         checkouts["other"] = options.other.resolve()
     shares = _shares(options.cores)[: options.runs]
-    print(json.dumps(measure(train, options.runs, checkouts, shares), indent=2))
+    print(json.dumps(measure([preset, *flags], options.runs, checkouts, shares), indent=2))
 
 
 def _shares(cores: int | None) -> list[set[int]]:
