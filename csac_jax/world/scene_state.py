@@ -72,7 +72,7 @@ def parked(slots: tuple[SlotKind, ...]) -> SceneState:
 def park(scene: SceneState, keep: jax.Array) -> SceneState:
     """Moves all blocks but those in `keep` [N] bool to their parking places."""
     keep = scene.in_play & keep
-    column, upright = keep[:, None], jnp.eye(1, 4, dtype=jnp.float32)
+    column, upright = keep[:, None], jnp.array([1.0, 0.0, 0.0, 0.0], jnp.float32)[None]
     position = jnp.where(column, scene.position, parking(keep.shape[0]))
     quaternion = jnp.where(column, scene.quaternion, upright)
     velocity = jnp.where(column, scene.velocity, 0.0)
