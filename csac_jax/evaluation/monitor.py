@@ -66,7 +66,7 @@ class Monitor(Callback):
         self._done = 0  # actions before the chunk that comes next
 
     def begin(self, run: RunInfo) -> None:
-        """Continues the log and the best state of a run that is resumed."""
+        """Restores the log and the best state of a run that is resumed."""
         self._run_dir, self._done = run.run_dir, run.step * self._cfg.train.scenes
         files.write_json(run.run_dir / PLAN, self._plan._asdict())
         files.truncate_log(run.run_dir / files.EVALUATIONS, run.step)
