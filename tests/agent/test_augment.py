@@ -122,7 +122,7 @@ def _signature(transition: Transition) -> tuple:
     return np.asarray(transition.obs.height).tobytes(), np.asarray(transition.obs.colour).tobytes()
 
 
-def test_random_symmetry_draws_all_eight_alike(transition):
+def test_symmetries_are_drawn_alike(transition):
     """Claim: each symmetry is equally likely (chi-square)."""
     small = jax.tree.map(lambda leaf: leaf[:2, :2] if leaf.ndim > 1 else leaf, transition)
     small = small.replace(obs=small.obs.replace(height=jnp.array([[1, 2], [3, 4]], jnp.uint16)))
