@@ -44,7 +44,7 @@ class EvalOptions:
     objects: str | None = None
     """Library of suites of objects, or procedural:SEED:COUNT; by default the policy's."""
     split: Literal["held_out", "train", "all"] = "held_out"
-    """Which of its objects."""
+    """Objects of the library to evaluate on."""
     physics: Literal["auto", "mjx", "c"] = "auto"
     """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
