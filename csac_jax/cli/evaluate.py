@@ -46,9 +46,9 @@ class EvalOptions:
     split: Literal["held_out", "train", "all"] = "held_out"
     """Objects of the library to evaluate on."""
     physics: Literal["auto", "mjx", "c"] = "auto"
-    """What moves the blocks: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
+    """Physics engine: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
-    """What moves the gripper: nothing, it floats as in training; or an arm."""
+    """Carrier of the gripper: none, it floats as in training; or an arm."""
     augment: Literal["on", "off"] | None = None
     """Decide by the mean Q over mirror images of the view; by default as the policy does."""
     height_bonus: float | None = None
