@@ -9,7 +9,7 @@ import difflib
 from collections.abc import Callable, Iterable
 
 from csac_jax.config import Config, RewardConfig
-from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 Algorithm = Callable[[Config], Config]
 
@@ -91,15 +91,13 @@ def register(name: str, algorithm: Algorithm) -> None:
 
     Raises SettingsError if the name is taken.
     """
-    if name in ALGORITHMS:
-        raise SettingsError(f"algorithm '{name}' exists; choose another name")
+    require(name not in ALGORITHMS, f"algorithm '{name}' exists; choose another name")
     ALGORITHMS[name] = algorithm
 
 
 def configure(cfg: Config, name: str) -> Config:
     """Returns the config with the settings of the algorithm `name`. Raises SettingsError."""
-    if name not in ALGORITHMS:
-        raise SettingsError(unknown("algorithm", name, ALGORITHMS))
+    require(name in ALGORITHMS, unknown("algorithm", name, ALGORITHMS))
     return ALGORITHMS[name](cfg).change(algo=name)
 
 

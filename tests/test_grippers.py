@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import deploy, grippers
-from csac_jax.deploy import decision, decision_program
+from csac_jax.deploy import decision
 from csac_jax.errors import SettingsError
 from csac_jax.robot.primitives import Action
 
@@ -128,10 +128,8 @@ def test_deployed_policy_takes_another_gripper():
     assert deploy.CameraPolicy.load("shipped").cfg.sim.gripper == "rg2"
     policy = deploy.CameraPolicy.load("shipped", gripper="2f85")
     height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
-    stations = decision_program.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
-    choice = decision_program.Choice(
-        Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations
-    )
+    stations = decision.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
+    choice = decision.Choice(Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations)
     decided = decision.from_choice(jax.device_get(choice), np.eye(4))
     assert decided.width == pytest.approx(0.085)
     with pytest.raises(SettingsError, match="neither one of"):

@@ -111,6 +111,6 @@ def with_inputs(params: Params, wanted: Params) -> Params:
 
 
 def with_trunk(state: LearnerState, trunk: Any) -> LearnerState:
-    """Replaces every trunk of the critics in an initial state, see `torchvision.variables`."""
+    """Replaces every trunk of the critics in an initial state, see `io.weights`."""
     critic = {name: {**part, "trunk": trunk[name]} for name, part in state.online.critic.items()}
     return with_params(state, state.online.replace(critic=critic))

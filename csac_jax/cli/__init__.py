@@ -35,6 +35,7 @@ from csac_jax.cli.failures import complain
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import files
+from csac_jax.section import require
 
 _LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or raise --devices"
 
@@ -138,8 +139,7 @@ def _dispatch(arguments: list[str]) -> int:
     if name == "--version":
         print(csac_jax.__version__)
         return 0
-    if name not in COMMANDS:
-        raise SettingsError(algorithms.unknown("command", name, COMMANDS))
+    require(name in COMMANDS, algorithms.unknown("command", name, COMMANDS))
     try:
         return COMMANDS[name](_on_device(rest))
     except (RuntimeError, AssertionError) as error:
@@ -156,8 +156,7 @@ def _on_device(arguments: list[str]) -> list[str]:
     device, rest = parsing.take(arguments, "--device")
     if device is None:
         return arguments
-    if device not in ("cpu", "gpu"):
-        raise SettingsError(f"--device: '{device}' is not one of: cpu, gpu")
+    require(device in ("cpu", "gpu"), f"--device: '{device}' is not one of: cpu, gpu")
     from csac_jax.runtime import devices
 
     devices.select("cpu" if device == "cpu" else "gpu")

@@ -17,6 +17,7 @@ from csac_jax.cli.failures import check_seed
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
 from csac_jax.runtime import processes, signals
+from csac_jax.section import require
 
 EPISODES = 50  # of every part of a suite, where neither --episodes nor --out is given
 TABLE = "table.md"  # in the folder --out
@@ -86,25 +87,21 @@ def run(arguments: list[str]) -> int:
 
 
 def _check(options: EvalOptions) -> None:
-    if options.episodes is not None and options.episodes < 1:
-        raise SettingsError("--episodes: at least 1")
-    if not 0.0 < options.share <= 1.0:
-        raise SettingsError("--share: above 0, at most 1")
-    if not 0 <= options.jobs <= 1024:
-        raise SettingsError("--jobs: must lie in 0 .. 1024")
+    require(options.episodes is None or options.episodes >= 1, "--episodes: at least 1")
+    require(0.0 < options.share <= 1.0, "--share: above 0, at most 1")
+    require(0 <= options.jobs <= 1024, "--jobs: must lie in 0 .. 1024")
     check_seed(options.seed)
     _which(options.which)
-    if options.out is None and (len(options.suites) != 1 or "all" in options.suites):
-        raise SettingsError("--suites: several need --out DIR")
-    if options.out is not None and options.json is not None:
-        raise SettingsError("--json: is for a single suite; --out writes a file for each")
+    single = len(options.suites) == 1 and "all" not in options.suites
+    require(single or options.out is not None, "--suites: several need --out DIR")
+    both = options.out is not None and options.json is not None
+    require(not both, "--json: is for a single suite; --out writes a file for each")
 
 
 def _which(text: str) -> Any:
     if text in ("best", "last"):
         return text
-    if not text.isdecimal():
-        raise SettingsError(f"--which: '{text}' is neither best, last nor a step")
+    require(text.isdecimal(), f"--which: '{text}' is neither best, last nor a step")
     return int(text)
 
 
@@ -166,8 +163,7 @@ def _measure(
 def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> int:
     from csac_jax.evaluation import suites
 
-    if out.exists() and not out.is_dir():
-        raise SettingsError(f"--out: {out} is a file; give a folder")
+    require(out.is_dir() or not out.exists(), f"--out: {out} is a file; give a folder")
     out.mkdir(parents=True, exist_ok=True)  # before hours of work
     policy, cfg = _policy(options, changes)
     chosen = _fitting(options, cfg) if "all" in options.suites else options.suites

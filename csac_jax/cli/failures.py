@@ -8,6 +8,7 @@ from csac_jax import grippers
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 
 def complain(code: int, error: object) -> int:
@@ -18,14 +19,13 @@ def complain(code: int, error: object) -> int:
 
 def check_seed(seed: int) -> None:
     """Raises SettingsError for a seed that is no key of JAX, of 32 bits."""
-    if not 0 <= seed < 2**31 - 1:
-        raise SettingsError("--seed: must lie in 0 .. 2147483646")
+    require(0 <= seed < 2**31 - 1, "--seed: must lie in 0 .. 2147483646")
 
 
 def check_extra(option: str, module: str, extra: str) -> None:
     """Raises SettingsError if the module that an option needs is not installed."""
-    if importlib.util.find_spec(module) is None:
-        raise SettingsError(f"{option} needs an extra; run: pip install 'csac-jax[{extra}]'")
+    remedy = f"run: pip install 'csac-jax[{extra}]'"
+    require(importlib.util.find_spec(module) is not None, f"{option} needs an extra; {remedy}")
 
 
 def exists(folder: Path) -> SettingsError:
@@ -36,12 +36,10 @@ def exists(folder: Path) -> SettingsError:
 def check_physics(cfg: Config, devices: int = 1) -> None:
     """Raises SettingsError for an unknown gripper, or physics that these devices cannot run."""
     grippers.load(cfg.sim.gripper)
-    if cfg.sim.physics == "c" and devices > 1:
-        text = "c computes on the host's cores, for one device; leave out --devices or take mjx"
-        raise SettingsError(f"--sim.physics: {text}")
+    text = "c computes on the host's cores, for one device; leave out --devices or take mjx"
+    require(cfg.sim.physics != "c" or devices == 1, f"--sim.physics: {text}")
     if cfg.sim.physics == "warp":
         import jax
 
-        if jax.default_backend() != "gpu":
-            text = "warp computes on CUDA, and JAX sees none here; leave it at mjx"
-            raise SettingsError(f"--sim.physics: {text}")
+        text = "warp computes on CUDA, and JAX sees none here; leave it at mjx"
+        require(jax.default_backend() == "gpu", f"--sim.physics: {text}")

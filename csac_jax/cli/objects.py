@@ -12,8 +12,9 @@ from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
 from csac_jax.cli.failures import check_extra, check_seed
 from csac_jax.cli.parsing import PROGRAM
-from csac_jax.errors import FailedError, SettingsError
+from csac_jax.errors import FailedError
 from csac_jax.runtime import processes
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +72,7 @@ def run(arguments: list[str]) -> int:
         known = ", ".join(COMMANDS)
         print(f"usage: {PROGRAM} objects COMMAND ..., with COMMAND one of: {known}")
         return 0 if name else 2
-    if name not in COMMANDS:
-        raise SettingsError(f"objects: {unknown('command', name, COMMANDS)}")
+    require(name in COMMANDS, f"objects: {unknown('command', name, COMMANDS)}")
     return COMMANDS[name](rest)
 
 
@@ -81,8 +81,8 @@ def _make(arguments: list[str]) -> int:
     check_seed(options.seed)
     from csac_jax.objects import library, shapes
 
-    if not 1 <= options.count <= library.MOST_OBJECTS:
-        raise SettingsError(f"--count: must lie in 1 .. {library.MOST_OBJECTS}")
+    most = library.MOST_OBJECTS
+    require(1 <= options.count <= most, f"--count: must lie in 1 .. {most}")
     _check_new(options.out)
     draw = shapes.draw_mixed if options.mixed else shapes.draw
     made = library.save(options.out, draw(options.seed, options.count)).objects
@@ -95,18 +95,18 @@ def _make(arguments: list[str]) -> int:
 def _import(arguments: list[str]) -> int:
     options = parsing.parse(ImportOptions, arguments, "objects import")
     _check_new(options.out)
-    if not (0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024):
-        raise SettingsError("--scale must be positive, --jobs lie in 0 .. 1024")
+    fits = 0.0 < options.scale < 1e6 and 0 <= options.jobs <= 1024
+    require(fits, "--scale must be positive, --jobs lie in 0 .. 1024")
     from csac_jax.objects import body, conversion, importing, library
 
     least, most = body.DENSITIES
-    if not least <= options.density <= most:
-        raise SettingsError(f"--density: must lie in {least:g} .. {most:g} kg/m^3")
+    known = f"must lie in {least:g} .. {most:g} kg/m^3"
+    require(least <= options.density <= most, f"--density: {known}")
     for module in importing.MODULES:
         check_extra("objects import", module, "objects")
     paths = importing.files(list(options.paths))
-    if len(paths) > library.MOST_OBJECTS:
-        raise SettingsError(f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time")
+    many = f"{len(paths)} files: at most {library.MOST_OBJECTS} at a time"
+    require(len(paths) <= library.MOST_OBJECTS, many)
     jobs, cache = options.jobs or processes.cores(), Path(f"{options.out}.partial")
     settings = conversion.ImportSettings(options.scale, options.density)
     with output.progress() as bar:
@@ -132,8 +132,7 @@ def _import(arguments: list[str]) -> int:
 
 
 def _check_new(folder: Path) -> None:
-    if folder.exists():
-        raise SettingsError(f"--out: {folder} exists; give another name")
+    require(not folder.exists(), f"--out: {folder} exists; give another name")
 
 
 def _show(arguments: list[str]) -> int:

@@ -18,7 +18,7 @@ from csac_jax import grippers
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
-from csac_jax.deploy import checks, decision, decision_program, images
+from csac_jax.deploy import checks, decision, images
 from csac_jax.deploy.checks import CameraReport
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import CameraView
@@ -32,10 +32,10 @@ from csac_jax.vision.heightmap import Observation
 MOST_ALTERNATIVES = 64
 
 _supported = jax.jit(depth_camera.supported)
-_observe = jax.jit(decision_program.observe, static_argnums=0)
-_dense_maps = jax.jit(decision_program.dense_maps, static_argnums=(0, 3))
-_choose = jax.jit(decision_program.choose, static_argnums=0)
-_best_over_yaws = jax.jit(decision_program.best_over_yaws, static_argnums=0)
+_observe = jax.jit(decision.observe, static_argnums=0)
+_dense_maps = jax.jit(decision.dense_maps, static_argnums=(0, 3))
+_choose = jax.jit(decision.choose, static_argnums=0)
+_best_over_yaws = jax.jit(decision.best_over_yaws, static_argnums=0)
 
 
 class Maps(NamedTuple):

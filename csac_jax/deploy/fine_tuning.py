@@ -14,7 +14,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
+from csac_jax.agent import actor_critic
+from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Learner, Transition
 from csac_jax.agent.rewards import ActionResult
 from csac_jax.config import Config, UniformReplay
@@ -22,11 +25,12 @@ from csac_jax.constants import CHANGE_AREA, OUTCOMES, Outcome, Primitive
 from csac_jax.deploy import CameraPolicy, record
 from csac_jax.deploy.record import PUSHED, Entry
 from csac_jax.errors import FailedError, SettingsError
+from csac_jax.replay import ring, samplers
 from csac_jax.robot.primitives import Action
-from csac_jax.runtime import cache
+from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
-from csac_jax.training import offline
-from csac_jax.training.offline import OfflineState
+from csac_jax.training import programs, step
+from csac_jax.training.step import Program
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 
@@ -67,6 +71,16 @@ class Experience(NamedTuple):
     terminated: Any  # [n] bool
 
 
+@struct.dataclass
+class OfflineState:
+    """The state from step to step; the ring is full."""
+
+    key: jax.Array  # [] typed key, root of all randomness, never consumed
+    step: jax.Array  # [] int32, steps done, each of `learn.updates_per_step` updates
+    learner: Any
+    replay: ring.ReplayState
+
+
 def run(
     policy: CameraPolicy,
     folder: Path,
@@ -82,10 +96,10 @@ def run(
     cache.enable()
     stop = stop or Stop()
     recorded = load(policy, record.read(folder))
-    program = offline.make(configure(policy.cfg, settings, len(recorded.outcome)))
-    key, learner = jax.random.key(settings.seed), offline.init(program, policy.params)
+    program = make_program(configure(policy.cfg, settings, len(recorded.outcome)))
+    key, learner = jax.random.key(settings.seed), init(program, policy.params)
     rewarded = transitions(policy, program.learner, learner, recorded)
-    state = OfflineState(key, jnp.int32(0), learner, offline.fill(program, rewarded))
+    state = OfflineState(key, jnp.int32(0), learner, fill(program, rewarded))
     state, errors, seconds = _learn(program, state, on_progress, stop)
     lifted = int((recorded.outcome == Outcome.LIFTED).sum())
     ends = (errors[0], errors[-1]) if errors else (0.0, 0.0)
@@ -108,14 +122,49 @@ def configure(cfg: Config, settings: Settings, num: int) -> Config:
     return dataclasses.replace(small, replay=UniformReplay(capacity=max(num, settings.batch)))
 
 
+@functools.lru_cache(maxsize=2)
+def make_program(cfg: Config) -> Program:
+    """Makes the program of a config, without environment; cached."""
+    no_env: Any = None
+    learner = CSAC(actor_critic.make(cfg))
+    return Program(cfg, no_env, learner, samplers.make(cfg.replay))
+
+
+def init(program: Program, params: actor_critic.Params) -> Any:
+    """Creates the learner's initial state with copies of these networks; the state is donated."""
+    fresh = jax.jit(program.learner.init)(jax.random.key(0))
+    return actor_critic.with_params(fresh, jax.tree.map(jnp.array, params))
+
+
+def fill(program: Program, transitions: Transition) -> ring.ReplayState:
+    """Creates a ring that these transitions, leaves [n, ...], fill."""
+    num = transitions.reward.shape[0]
+    empty = ring.init(program.sampler.init(num), programs.example(program.cfg))
+    return ring.add(empty, transitions, jnp.ones(num, bool))
+
+
+@functools.lru_cache(maxsize=2)
+def compile_step(program: Program):
+    """Returns a jitted function state -> (state, losses), of one step; the state is donated."""
+    cfg = program.cfg
+
+    def one(state: OfflineState) -> tuple[OfflineState, dict[str, jax.Array]]:
+        key, done = jax.random.fold_in(state.key, state.step), state.step * UPDATES
+        learner, priority, losses = step.learn(program, key, state.learner, state.replay, done)
+        replay = state.replay.replace(priority=priority)
+        return OfflineState(state.key, state.step + 1, learner, replay), losses
+
+    return jax.jit(one, donate_argnums=0, compiler_options=compiler.options(cfg))
+
+
 def _learn(
-    program: offline.Program, state: OfflineState, on_progress: Progress, stop: Stop
+    program: Program, state: OfflineState, on_progress: Progress, stop: Stop
 ) -> tuple[OfflineState, list[float], float]:
     """Runs all steps; returns the state, the TD error of each step, and the seconds."""
-    total, step = program.cfg.train.steps, offline.compile_step(program)
+    total, learn = program.cfg.train.steps, compile_step(program)
     errors, begun = list[float](), time.perf_counter()
     while len(errors) < total and stop.signal is None:
-        state, losses = step(state)
+        state, losses = learn(state)
         errors.append(float(losses["td_error"]))
         updates = len(errors) * UPDATES
         if not jnp.isfinite(losses["critic_loss"] + losses["actor_loss"]):

@@ -22,7 +22,7 @@ from csac_jax.agent import actor_critic, maps, policy
 from csac_jax.agent.actor_critic import Params
 from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
-from csac_jax.deploy import decision_program, stablehlo
+from csac_jax.deploy import decision, stablehlo
 from csac_jax.errors import SettingsError
 from csac_jax.robot.primitives import Action
 from csac_jax.sim.outcome import BARE
@@ -56,15 +56,15 @@ def _decide(cfg: Config, params: Params) -> Callable[..., tuple[jax.Array, ...]]
 
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> tuple[jax.Array, ...]:
         marked = target[0] if target else jnp.ones(height.shape, bool)
-        obs = Observation(colour, height, marked, decision_program.fingers(cfg))
-        q = decision_program.dense_maps(unmasked, params, obs, has_target).q
+        obs = Observation(colour, height, marked, decision.fingers(cfg))
+        q = decision.dense_maps(unmasked, params, obs, has_target).q
         valid = _actionable_cells(frames, obs)
         cells = jnp.stack([maps.best_cells(*one, 1)[0] for one in zip(q, valid, strict=True)])
         values = jnp.stack([one.reshape(-1)[cell] for one, cell in zip(q, cells, strict=True)])
         primitive = rule(values, jnp.int32(0))
         pose = maps.cell_pose(frames, cells[primitive])
         can_act = jnp.stack([one.any() for one in valid])[primitive]
-        stations = decision_program.stations(cfg, height, Action(primitive, pose))
+        stations = decision.stations(cfg, height, Action(primitive, pose))
         return primitive, pose, values[primitive], can_act, stations, q, valid
 
     return decide

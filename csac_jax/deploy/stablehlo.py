@@ -22,7 +22,7 @@ import numpy as np
 
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
-from csac_jax.deploy import decision_program
+from csac_jax.deploy import decision
 from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
 
@@ -42,7 +42,7 @@ def from_maps(cfg: Config, params: Params) -> tuple[Callable[..., Outputs], tupl
 
     def decide(colour: jax.Array, height: jax.Array, *target: jax.Array) -> Outputs:
         marked = target[0] if target else jnp.ones(height.shape, bool)
-        obs = Observation(colour, height, marked, decision_program.fingers(cfg))
+        obs = Observation(colour, height, marked, decision.fingers(cfg))
         return _outputs(cfg, params, obs)
 
     return decide, map_shapes(cfg)
@@ -62,7 +62,7 @@ def from_image(
         points = _points(depth, lens, pose).reshape(-1, 3)
         marked = mask[0].reshape(-1) if mask else None
         colour, valid = rgb.reshape(-1, 3), depth_camera.supported(depth, lens[0]).reshape(-1)
-        return _outputs(cfg, params, decision_program.observe(cfg, points, valid, colour, marked))
+        return _outputs(cfg, params, decision.observe(cfg, points, valid, colour, marked))
 
     rows = size[::-1]
     floats = [_ARRAY(shape, np.float32) for shape in (rows, (4,), (4, 4))]
@@ -80,8 +80,8 @@ def _points(depth: jax.Array, lens: jax.Array, pose: jax.Array) -> jax.Array:
 
 
 def _outputs(cfg: Config, params: Params, obs: Observation) -> Outputs:
-    state = decision_program.dense_maps(cfg, params, obs, cfg.task.kind == "target")
-    choice, _ = decision_program.choose(cfg, state, obs.height)
+    state = decision.dense_maps(cfg, params, obs, cfg.task.kind == "target")
+    choice, _ = decision.choose(cfg, state, obs.height)
     action = choice.action
     return action.primitive, action.pose, choice.score, choice.valid, choice.stations
 

@@ -181,11 +181,6 @@ def sound(run_dir: Path, step: int | None = None) -> Path:
     raise CheckpointError(f"{faults[0]}; {remedy}")
 
 
-def set_aside(run_dir: Path, step: int | None = None) -> None:
-    """Moves steps newer than `step`, by default the newest sound one, to another folder."""
-    set_aside_after(run_dir, int(sound(run_dir, step).name))
-
-
 def set_aside_after(run_dir: Path, step: int) -> None:
     """Moves steps newer than `step`, sound or not, to another folder."""
     for number in _steps(run_dir):

@@ -38,7 +38,7 @@ def read(path: Path) -> Any:
         raise ValueError("has no geom")
     import trimesh
 
-    meshes = [_placed(model, data, int(geom)) for geom in geoms]
+    meshes = [surface(model, geom).apply_transform(_pose(data, geom)) for geom in map(int, geoms)]
     if len(meshes) == 1:
         return meshes[0]
     closed = all(mesh.is_volume for mesh in meshes)  # overlaps count once
@@ -52,8 +52,14 @@ def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
             raise ValueError(f"names '{mesh.file}', outside of its folder; move it there")
 
 
-def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
-    """Builds the mesh of one geom, m, at its pose."""
+def _pose(data: mujoco.MjData, geom: int) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
+    return pose
+
+
+def surface(model: mujoco.MjModel, geom: int) -> Any:
+    """Builds the mesh of trimesh of one geom, m, in its frame. Raises ValueError for a plane."""
     import trimesh
 
     size, kind, make = model.geom_size[geom], int(model.geom_type[geom]), trimesh.creation
@@ -75,6 +81,4 @@ def _placed(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Any:
     }
     if kind not in makers:
         raise ValueError(f"has a geom of kind {_Geom(kind).name[7:].lower()}; give it a mesh")
-    place = np.eye(4)
-    place[:3, :3], place[:3, 3] = data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom]
-    return makers[_Geom(kind)]().apply_transform(place)
+    return makers[_Geom(kind)]()

@@ -13,6 +13,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from csac_jax.objects import descriptions
 from csac_jax.render import gl, media
 
 PORT = 8080  # of the page, or the next free one
@@ -112,28 +113,9 @@ def _page(model: mujoco.MjModel, log: Callable[[str], None]) -> Iterator[Show]:
 
 def mesh(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices [V, 3], m, in the geom's frame, and triangles [F, 3] of its surface."""
-    import trimesh
-
-    size, kind = model.geom_size[geom], mujoco.mjtGeom(int(model.geom_type[geom]))
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        return _compiled_mesh(model, int(model.geom_dataid[geom]))
-    x, y, _ = np.where(size > 0.0, size, _PLANE)
-    shapes = {
-        mujoco.mjtGeom.mjGEOM_BOX: lambda: trimesh.creation.box(2.0 * size),
-        mujoco.mjtGeom.mjGEOM_SPHERE: lambda: trimesh.creation.icosphere(radius=size[0]),
-        mujoco.mjtGeom.mjGEOM_CYLINDER: lambda: trimesh.creation.cylinder(size[0], 2.0 * size[1]),
-        mujoco.mjtGeom.mjGEOM_CAPSULE: lambda: trimesh.creation.capsule(2.0 * size[1], size[0]),
-        mujoco.mjtGeom.mjGEOM_PLANE: lambda: trimesh.creation.box(
-            bounds=((-x, -y, -0.002), (x, y, 0.0))  # its top is the plane
-        ),
-    }
-    if kind not in shapes:
-        raise ValueError(f"geom {geom}: {kind.name} has no picture in the page")
-    surface = shapes[kind]()
-    return np.asarray(surface.vertices), np.asarray(surface.faces)
-
-
-def _compiled_mesh(model: mujoco.MjModel, number: int) -> tuple[np.ndarray, np.ndarray]:
-    first, count = model.mesh_vertadr[number], model.mesh_vertnum[number]
-    face, faces = model.mesh_faceadr[number], model.mesh_facenum[number]
-    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
+        surface = descriptions.surface(model, geom)
+        return np.asarray(surface.vertices), np.asarray(surface.faces)
+    x, y, _ = np.where(model.geom_size[geom] > 0.0, model.geom_size[geom], _PLANE)
+    corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+    return corners, np.array([[0, 1, 2], [0, 2, 3]])

@@ -8,18 +8,12 @@ import itertools
 import mimetypes
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import csac_jax
 from csac_jax.report import figures, result_tables, results
-from csac_jax.report.comparison import ResultReport, grouped
-from csac_jax.report.result_tables import ResultTable
-from csac_jax.report.variants import label
+from csac_jax.report.comparison import ResultReport
 
-BETTER = {result_tables.LAST, result_tables.AREA, "blocks / action", "lifted / grasp"}
-BETTER |= {results.METRICS[name] for name in result_tables.IMPROVED}
-"""Columns in which more is better: the best of alike rows is bold."""
-FOLDED = ("Differences in training", "Differences", "Failures", "Provenance")
+FOLDED = ("Differences in training", "Differences", "Provenance")
 MEDIA = {".png": "image", ".gif": "image", ".webp": "image", ".jpg": "image", ".mp4": "video"}
 LARGEST = 8 * 2**20  # bytes of a picture or video that the page takes up
 MOST_MEDIA = 12
@@ -41,7 +35,6 @@ def render(report: ResultReport, paths: Sequence[Path]) -> str:
 
     source = Path(__file__).with_name("page.html").read_text()
     template = jinja2.Template(source, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    tables = {title: _cells(report, one) for title, one in result_tables.tables(report).items()}
     drawn = [
         (chart.title, _url("image/svg+xml", figures.svg(chart.figure)))
         for chart in figures.draw(report)
@@ -50,40 +43,11 @@ def render(report: ResultReport, paths: Sequence[Path]) -> str:
         version=csac_jax.__version__,
         explained=result_tables.EXPLAINED,
         figures=drawn,
-        tables=tables,
+        tables=result_tables.tables(report),
         folded=FOLDED,
         media=list(media(paths)),
         notes=report.notes,
     )
-
-
-def _cells(report: ResultReport, table: ResultTable) -> list[list[tuple[str, bool]]]:
-    """Returns the rows of a table as (text, is best); the first row is its head."""
-    variants = (one.variant for one in (*report.curves, *report.scores))
-    best = _best(table, {label(one): one.preset for one in variants})
-    rows = ([(row[name], (i, name) in best) for name in row] for i, row in enumerate(table))
-    return [[(name, False) for name in table[0]], *rows]
-
-
-def _best(table: ResultTable, presets: dict[str, str]) -> set[tuple[int, str]]:
-    """Finds row and column of the largest values among methods of the same preset and scenes."""
-
-    def alike(i: int) -> tuple[Any, ...] | None:
-        name, *_ = table[i].values()
-        place = presets.get(name), table[i].get("part"), table[i].get("physics, robot, seed")
-        return place if name in presets else None
-
-    best = set()
-    for place, rows in grouped(range(len(table)), alike).items():
-        for column in BETTER & set(table[0]) if place else ():
-            values = {i: _number(table[i][column]) for i in rows if table[i][column] != "-"}
-            if len(values) > 1:
-                best |= {(i, column) for i in values if values[i] == max(values.values())}
-    return best
-
-
-def _number(text: str) -> float:
-    return float(text.split()[0].replace(",", ""))
 
 
 def media(paths: Iterable[Path]) -> Iterator[tuple[str, str, str]]:

@@ -120,7 +120,6 @@ def tables(report: ResultReport) -> dict[str, ResultTable]:
         "Evaluation": evaluation(report),
         "Differences in training": training_differences(report),
         "Differences": differences(report),
-        "Failures": failures(report),
         "Provenance": provenance(report),
     }
     return {title: table for title, table in titled.items() if table}
@@ -212,29 +211,6 @@ def differences(report: ResultReport) -> ResultTable:
             row[title] = _difference(gaps.get(key), chances.get(key), key)
         rows.append(row)
     return rows
-
-
-def failures(report: ResultReport) -> ResultTable:
-    """Builds the table of causes of failure, all runs summed: cases, and out of how many."""
-    recorded = [
-        (score.only(part), [one.metrics["failures"] for one in runs])
-        for score in report.scores
-        for part, runs in score.parts.items()
-        if all("failures" in one.metrics for one in runs)
-    ]
-    causes = dict.fromkeys(cause for _, runs in recorded for run in runs for cause in run)
-    return [
-        {"policy": score.name, **_place_cells(score)}
-        | {cause.replace("_", " "): _sum_cases(runs, cause) for cause in causes}
-        for score, runs in recorded
-    ]
-
-
-def _sum_cases(runs: Sequence[Json], cause: str) -> str:
-    shares = [run[cause] for run in runs if cause in run]
-    n = sum(share["n"] for share in shares)
-    cases = sum(round(share["n"] * (share["value"] or 0.0)) for share in shares)
-    return f"{cases} / {n}" if n else "-"
 
 
 def _place_cells(score: Score) -> dict[str, str]:

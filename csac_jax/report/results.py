@@ -47,7 +47,7 @@ _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
 _RECORD = {"device": _TEXT, "versions": dict | None, "commit": _TEXT, "wall_seconds": _NUMBER}
 _COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
-_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS, "failures": {}}
+_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "config": _CONFIG, "parts": {}}
 
 
@@ -249,9 +249,7 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
 
 def _check_part(part: Any) -> None:
     _check(part, _METRICS, "a part")
-    shares = [part[name] for name in METRICS if part.get(name)]
-    for share in [*shares, *part.get("failures", {}).values()]:
-        _check(share, _SHARE, "a share")
+    for share in [part[name] for name in METRICS if part.get(name)]:
         if not _SHARE.keys() <= share.keys():
             raise ValueError("a share lacks its interval")
 

@@ -41,10 +41,7 @@ def call(function: Callable[..., Any], key: str, result: Any, *arguments: Any) -
 
 @functools.cache
 def _register() -> None:
-    make = ctypes.pythonapi.PyCapsule_New
-    make.restype, make.argtypes = ctypes.py_object, (c_void_p, c_char_p, c_void_p)
-    capsule = make(ctypes.cast(_handler, c_void_p), b"xla._CUSTOM_CALL_TARGET", None)
-    jax.ffi.register_ffi_target(TARGET, capsule, platform="cpu")
+    jax.ffi.register_ffi_target(TARGET, jax.ffi.pycapsule(_handler), platform="cpu")
 
 
 def _struct(name: str, **fields: Any) -> Any:

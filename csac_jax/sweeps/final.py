@@ -15,14 +15,14 @@ from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.runner import SweepPlan, runs_of
-from csac_jax.training.loop import Reporter
+from csac_jax.training.progress import Terminal
 
 OWN = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
 SEED = 0  # of the evaluation: all policies of a point meet the same scenes
 
 
 def measure(
-    plan: SweepPlan, folder: Path, reporter: Reporter, stop: Stop, suite: str = OWN
+    plan: SweepPlan, folder: Path, reporter: Terminal, stop: Stop, suite: str = OWN
 ) -> int | None:
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises

@@ -34,6 +34,7 @@ from csac_jax.sweeps import grid
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
 from csac_jax.training.callbacks import Record
+from csac_jax.training.progress import Terminal
 
 SUMMARY = "summary.json"
 DIGEST = "sha256"  # key of the plan's own digest
@@ -67,7 +68,7 @@ def run(
     plan: SweepPlan,
     folder: Path,
     make_program: Callable[[ProgramGroup], SweepProgram],
-    reporter: loop.Reporter,
+    reporter: Terminal,
     stop: Stop,
     resume: bool = False,
 ) -> SweepResult:
@@ -195,7 +196,7 @@ class _Sweep:
 
     folder: Path
     groups: list[tuple[ProgramGroup, list[Path]]]
-    reporter: loop.Reporter
+    reporter: Terminal
     stop: Stop
     stopped: int | None = None  # number of the signal that all processes know of
     compiled: list[float] = dataclasses.field(default_factory=list)  # s, of each group
@@ -263,7 +264,7 @@ class _GroupTraining:
             self.loop_states = [loop.LoopState(*loop_state) for loop_state, _ in extra["runs"]]
             self.failed = [failed for _, failed in extra["runs"]]
             if cluster.is_first():
-                checkpoint.set_aside(folder)
+                checkpoint.set_aside_after(folder, int(self.state.step))
         self.step = int(self.state.step)
         self.saved = self.step if self.step else None
         if cluster.is_first():
@@ -282,7 +283,7 @@ class _GroupTraining:
         """Returns True if all runs are done or have failed."""
         return None not in self.failed or self.step >= loop.total_steps(self.cfg)
 
-    def advance(self, chunk: Callable[[Any], Any], reporter: loop.Reporter) -> list[Record]:
+    def advance(self, chunk: Callable[[Any], Any], reporter: Terminal) -> list[Record]:
         """Runs a chunk and saves if it is time; logs and returns a record of each sound run."""
         self.state, metrics, seconds = loop.timed(chunk, self.state)
         self.step += self.cfg.train.chunk

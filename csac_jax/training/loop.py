@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ from csac_jax.runtime import cache, compiler
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import memory
 from csac_jax.training.callbacks import Callback, Record, RunInfo, Summary
+from csac_jax.training.progress import Terminal
 from csac_jax.training.transitions import LOSSES
 
 SUMS = (
@@ -32,16 +33,6 @@ DIVERGED_SHARE = 1e-3  # of a chunk's actions: more diverged physics is logged; 
 
 class TrainingError(FailedError):
     """A run that cannot continue."""
-
-
-class Reporter(Protocol):
-    """A display of a run."""
-
-    def log(self, text: str) -> None:
-        """Shows a line about an event."""
-
-    def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Shows a chunk; `eta` is the remaining time, s, if known."""
 
 
 class LoopState(NamedTuple):
@@ -71,7 +62,7 @@ def run(
     run_dir: Path,
     init: Callable[[], Any],
     compile_chunk: Callable[[int], Any],
-    reporter: Reporter,
+    reporter: Terminal,
     stop: Stop,
     resume: bool = False,
     at: int | None = None,
@@ -108,7 +99,7 @@ def _train(
     run_dir: Path,
     start: _Start,
     compile_chunk: Callable[[int], Any],
-    reporter: Reporter,
+    reporter: Terminal,
     stop: Stop,
     callbacks: Sequence[Callback],
 ) -> Summary:
@@ -165,8 +156,8 @@ def _begin(
         files.truncate_log(run_dir / files.METRICS, 0)
         return _Start(0, LoopState(0.0, []), None, shapes, thread.submit(init))
     state, extra = checkpoint.restore(run_dir, shapes, at)
-    checkpoint.set_aside(run_dir, at)
     step = int(state.step)
+    checkpoint.set_aside_after(run_dir, step)
     files.truncate_log(run_dir / files.METRICS, step)
     loop_state = LoopState(extra["seconds"], extra["grasps"])
     return _Start(step, loop_state, step, shapes, thread.submit(lambda: state))
@@ -182,7 +173,7 @@ def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
 
 
 def compile_program(
-    cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Reporter
+    cfg: Config, compile_chunk: Callable[[int], Any], state: Any, reporter: Terminal
 ) -> tuple[Any, float]:
     """Compiles a chunk for states like this; returns it and the seconds that it took."""
     reporter.log("compiling the training program; this takes a while, once")

@@ -44,7 +44,7 @@ class Terminal:
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def progress(self, record: Record, total_actions: int, eta: float | None) -> None:
-        """Moves the bar; without a terminal, prints a line if one is due."""
+        """Moves the bar; without a terminal, prints a line if one is due. `eta` is the rest, s."""
         text, now, done = _describe(record, eta), time.monotonic(), record.actions
         if self._console.is_terminal:
             if not self._bar.task_ids:

@@ -14,7 +14,7 @@ import pytest
 from csac_jax import cli, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import Config
-from csac_jax.deploy import CameraPolicy, decision_program, stablehlo
+from csac_jax.deploy import CameraPolicy, decision, stablehlo
 from csac_jax.errors import SettingsError
 from csac_jax.io import policy_file
 from csac_jax.vision.heightmap import Observation
@@ -110,7 +110,7 @@ def test_onnx(policy: CameraPolicy, shown: Any, tmp_path: Path):
     results = _alone(_BY_ONNXRUNTIME, tmp_path / "policy.onnx", "--format", "onnx", **shown)
     cfg = policy.cfg.change(policy={"place": "argmax"})
     _assert_close(results, cfg, policy.params, *shown.values(), scale=1.0)
-    look = jax.jit(lambda obs: decision_program.dense_maps(cfg, policy.params, obs, False))
+    look = jax.jit(lambda obs: decision.dense_maps(cfg, policy.params, obs, False))
     np.testing.assert_allclose(results[5], look(policy.observe(*IMAGE)).q, atol=TOLERANCE, rtol=0)
 
 
@@ -126,7 +126,7 @@ def _random(cfg: Config) -> tuple[Any, Observation]:
         height[row : row + 8, col : col + 6] = rng.uniform(0.02, 0.08)
         target[row : row + 8, col : col + 6] = number % 2 == 0
     colour = rng.uniform(size=(*rows, 3)).astype(np.float32)
-    return params, Observation(colour, height, target, decision_program.fingers(cfg))
+    return params, Observation(colour, height, target, decision.fingers(cfg))
 
 
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -152,7 +152,7 @@ def test_onnx_of_other_nets(name: str):
     cfg = presets.smoke().change(**SETTINGS[name]).change(policy={"place": "argmax"})
     params, obs = _random(cfg)
     session = onnxruntime.InferenceSession(onnx.serialize(cfg, params))
-    look = jax.jit(lambda o: decision_program.dense_maps(cfg, params, o, False))
+    look = jax.jit(lambda o: decision.dense_maps(cfg, params, o, False))
     for height in (obs.height, np.zeros_like(obs.height)):
         maps = [obs.colour, height, *([obs.target] if cfg.task.kind == "target" else [])]
         results = session.run(None, dict(zip(onnx.INPUTS, maps, strict=False)))

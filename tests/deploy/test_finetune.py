@@ -25,7 +25,6 @@ from csac_jax.deploy.record import Recorder, ReportedOutcome
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import policy_file
 from csac_jax.runtime.signals import Stop
-from csac_jax.training import offline
 from csac_jax.vision import heightmap
 from tests.deploy import scenes
 
@@ -69,8 +68,8 @@ End = ReportedOutcome(outcome="lifted", ended=True)
 
 
 def _transitions(policy: CameraPolicy, loaded: fine_tuning.Experience) -> Any:
-    program = offline.make(fine_tuning.configure(policy.cfg, Settings(batch=2), 4))
-    state = offline.init(program, policy.params)
+    program = fine_tuning.make_program(fine_tuning.configure(policy.cfg, Settings(batch=2), 4))
+    state = fine_tuning.init(program, policy.params)
     return fine_tuning.transitions(policy, program.learner, state, loaded)
 
 

@@ -10,7 +10,7 @@ import csac_jax
 from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
-from csac_jax.deploy import CameraPolicy, Decision, decision_program
+from csac_jax.deploy import CameraPolicy, Decision, decision as decisions_of
 from csac_jax.errors import SettingsError, ViewError
 from csac_jax.vision import camera, observe, raycast
 from tests.deploy import scenes
@@ -59,7 +59,7 @@ def test_decides_on_the_blocks(decisions: list[Decision]):
         assert decision.width == pytest.approx(0.11)
     places = np.array([decision.position[:2] for decision in decisions])
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(4, 1)]
-    assert apart.min() >= decision_program.APART - 1e-6
+    assert apart.min() >= decisions_of.APART - 1e-6
     assert decisions[0].score == max(decision.score for decision in decisions)
 
 
@@ -119,7 +119,7 @@ def test_push_waypoints(policy: CameraPolicy):
     height = np.full((64, 64), 0.05, np.float32)
     for x, length in ((0.0, 0.1), (0.2, 0.024)):
         action = csac_jax.Action.push(x, 0.0, 0.0)
-        stations = np.asarray(decision_program.stations(policy.cfg, height, action))
+        stations = np.asarray(decisions_of.stations(policy.cfg, height, action))
         np.testing.assert_allclose(stations[:, 0], [x, x, x + length, x + length], atol=1e-5)
         np.testing.assert_allclose(stations[:, 2], [0.13, 0.03, 0.03, 0.13], atol=1e-5)
         np.testing.assert_allclose(stations[:, 4], 0.0)

@@ -256,7 +256,7 @@ def test_damaged_step_is_set_aside(run_dir: Path):
     """Claim: a run that goes on from an older step moves the damaged one out of the way, whole."""
     _data_file(run_dir, 8).unlink()
     with pytest.warns(DataWarning, match="going back to step 4"):
-        checkpoint.set_aside(run_dir)
+        checkpoint.set_aside_after(run_dir, int(checkpoint.sound(run_dir).name))
     assert (run_dir / "checkpoints" / checkpoint.SET_ASIDE / "8" / checkpoint.MANIFEST).is_file()
     assert _same(checkpoint.restore(run_dir, _abstract())[0], _state(4))
 

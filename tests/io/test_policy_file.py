@@ -17,7 +17,7 @@ import safetensors.numpy
 from csac_jax import deploy, grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
-from csac_jax.deploy import decision, decision_program
+from csac_jax.deploy import decision
 from csac_jax.errors import DataWarning
 from csac_jax.io import configs, policy_file
 from csac_jax.io.policy_file import PolicyFileError
@@ -106,8 +106,8 @@ def test_grippers_of_one_folder_name_are_two(tmp_path: Path, params: Params):
     for name, policy in loaded.items():
         height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
         action = Action.grasp(0.0, 0.0, 0.0)
-        stations = decision_program.stations(policy.cfg, height, action)
-        choice = decision_program.Choice(action, jnp.zeros(()), jnp.bool(True), stations)
+        stations = decision.stations(policy.cfg, height, action)
+        choice = decision.Choice(action, jnp.zeros(()), jnp.bool(True), stations)
         width = decision.from_choice(jax.device_get(choice), np.eye(4)).width
         assert width == pytest.approx(openings[name.split("_")[0]])
 

@@ -14,7 +14,6 @@ from csac_jax import cli, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import DenseNet121
 from csac_jax.io import weights
-from csac_jax.nets import torchvision
 from csac_jax.runtime import signals
 from tests.sections import with_constants
 
@@ -98,7 +97,7 @@ def test_names_of_densenet_121_fit():
     zeros = {
         name: np.broadcast_to(np.float32(0.0), shape) for name, shape in _names((6, 12, 24, 16), 32)
     }
-    got = torchvision.variables(DenseNet121(norm="batch"), zeros)
+    got = weights.variables(DenseNet121(norm="batch"), zeros)
     assert sum(leaf.size for leaf in jax.tree.leaves(got)) == 7_037_504
 
 

@@ -5,7 +5,7 @@ from matplotlib.colors import to_rgb
 
 import csac_jax
 from csac_jax import presets
-from csac_jax.deploy import Maps, decision, decision_program, images
+from csac_jax.deploy import Maps, decision, images
 from csac_jax.render import decision_picture as drawn, heatmaps
 from tests.deploy import scenes
 
@@ -16,8 +16,8 @@ HEIGHT = np.full((CFG.heightmap.size,) * 2, 0.05, np.float32)
 
 
 def _decision(action: csac_jax.Action) -> decision.Decision:
-    stations = decision_program.stations(CFG, HEIGHT, action)
-    choice = decision_program.Choice(action, np.float32(1.0), np.bool_(True), stations)
+    stations = decision.stations(CFG, HEIGHT, action)
+    choice = decision.Choice(action, np.float32(1.0), np.bool_(True), stations)
     return decision.from_choice(choice, np.eye(4))
 
 

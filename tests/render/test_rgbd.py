@@ -13,7 +13,7 @@ import pytest
 
 from csac_jax.constants import Primitive
 from csac_jax.deploy import decision
-from csac_jax.deploy.decision_program import Choice, stations
+from csac_jax.deploy.decision import Choice, stations
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
