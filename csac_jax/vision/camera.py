@@ -1,10 +1,7 @@
-"""A pinhole camera: depth and colour images, and pixels as points in space.
+"""A pinhole camera: its pixels as rays and as points in space, and shading.
 
 The camera looks along its z, x is right and y down in the image; row 0 is the top row. A pixel's
 ray is not of unit length: it advances by 1 m in depth, along z, per unit of distance.
-
-    eye = camera.make(CameraConfig().scaled(0.5))
-    picture = camera.render(eye, solids.place(geoms.read(model), data.geom_xpos, data.geom_xmat))
 """
 
 import functools
@@ -18,8 +15,6 @@ import numpy as np
 from flax import struct
 
 from csac_jax.config import CameraConfig
-from csac_jax.vision import raycast
-from csac_jax.world.solids import Solids
 
 LIGHT = (0.36, 0.48, 0.8)  # unit vector towards the light; oblique, so that slopes differ
 AMBIENT = 0.4  # share of the colour that a face turned away from the light keeps
@@ -36,16 +31,6 @@ class Camera:
     rotation: jax.Array  # [3, 3] camera to world
     width: int = struct.field(pytree_node=False)  # W, px
     height: int = struct.field(pytree_node=False)  # H, px
-
-
-@struct.dataclass
-class Picture:
-    """An image of a camera."""
-
-    colour: jax.Array  # [H, W, 3] float32, 0 .. 1
-    depth: jax.Array  # [H, W] float32 m, along the optical axis; 0 where not valid
-    geom: jax.Array  # [H, W] int32, `Hit.geom`
-    valid: jax.Array  # [H, W] bool, True if the pixel sees anything
 
 
 def make(cfg: CameraConfig) -> Camera:
@@ -118,12 +103,3 @@ def shade(colour: jax.Array, normal: jax.Array, light: Any = LIGHT) -> jax.Array
     x, y, z = light
     cosine = normal[:, 0] * x + normal[:, 1] * y + normal[:, 2] * z  # [S]
     return (AMBIENT + (1.0 - AMBIENT) * jnp.maximum(cosine, 0.0))[:, None] * colour
-
-
-def render(camera: Camera, solids: Solids) -> Picture:
-    """Renders a scene of any geoms, flat shaded."""
-    hit = cast_rays(camera, raycast.cast_solids, solids)
-    flat = jnp.asarray(solids.colour).at[jnp.maximum(hit.geom, 0)].get(mode="promise_in_bounds")
-    lit = shade(flat.reshape(-1, 3), hit.normal.reshape(-1, 3)).reshape(flat.shape)
-    colour = jnp.where(hit.valid[..., None], lit, SKY[None, None])
-    return Picture(colour, jnp.where(hit.valid, hit.distance, 0.0), hit.geom, hit.valid)

@@ -1,11 +1,13 @@
-"""One ray against the table and convex blocks, or against geoms of any kind; callers vmap.
+"""One ray against the table, convex blocks and objects; callers vmap.
 
 Faces and geoms are folded one after another, so vmap forms no [R, G, F] array. Half-spaces in the
-world frame have no ray axis under `vmap(cast, in_axes=(None, 0, 0))`.
+world frame have no ray axis under `vmap(cast, in_axes=(None, 0, 0))`. A ray that starts inside a
+geom does not hit it. Products are in scalars: under vmap every step is one fused loop over rays, 20
+times faster than with vectors.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -13,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from csac_jax.vision import ray_shapes
-from csac_jax.world.solids import GeomGroup, Solids
+_PARALLEL = np.float32(1e-30)  # n . d of a plane along the ray, in place of 0
+_ON_PLANE = np.float32(1e-12)  # m, depth of an origin that lies on a plane
 
+Vector = jax.Array | Sequence[jax.Array]  # [3], or its three scalars []
 # Rows and columns [h, w] of a grid of rays -> their origin and direction, [h, w, 3] or one for all.
 Ray = Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
 
@@ -47,22 +50,54 @@ class ObjectShapes:
     radius: float = struct.field(pytree_node=False)  # m, of a ball about `centre` that holds it
 
 
-@struct.dataclass
-class Hit:
-    """First hit of one ray; normal and geom are meaningless where not valid."""
-
-    distance: jax.Array  # [] in lengths of the ray's direction; infinite where not valid
-    normal: jax.Array  # [3] outward unit normal of the surface, world frame
-    geom: jax.Array  # [] int32, number of the geom
-    valid: jax.Array  # [] bool, True if the ray hits anything
-
-
 class SurfaceHit(NamedTuple):
     """First hit of one ray. Surfaces: 0 the table, 1 + g F + f face f of geom g, then objects."""
 
-    distance: jax.Array  # [] as in Hit
+    distance: jax.Array  # [] in lengths of the direction; infinite where not valid
     surface: jax.Array  # [] int32; 0 where not valid
     valid: jax.Array  # [] bool
+
+
+def _dot(a: Vector, b: Vector) -> jax.Array:
+    return functools.reduce(jnp.add, (a[axis] * b[axis] for axis in range(len(a))))
+
+
+def enter_half_spaces(
+    normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Intersects one ray with half-spaces, normals [F, 3] and offsets [F] m (slab method, Kay and
+    Kajiya 1986). Returns distance, face int32 and bool, the ray enters, all [].
+
+    t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
+    leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
+    never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
+    that share a direction share the division.
+    """
+    whole = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
+    enter, leave, face = clip(normal, offset, origin, direction, whole, 0)
+    return enter, face, (enter >= 0.0) & (enter <= leave)
+
+
+def clip(
+    normal: jax.Array,
+    offset: jax.Array,
+    origin: Vector,
+    direction: Vector,
+    part: tuple[jax.Array, jax.Array, jax.Array],
+    first: jax.Array | int,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cuts a ray's part (enter, leave, face), all [], by half-spaces, numbered from `first`."""
+    enter, leave, face = part
+    for f in range(normal.shape[0]):
+        speed = _dot(normal[f], direction)
+        inverse = 1.0 / jnp.where(speed == 0.0, _PARALLEL, speed)
+        depth = (offset[f] - _dot(normal[f], origin)) + _ON_PLANE  # m, not negative inside
+        crossing = depth * inverse
+        inwards = jnp.where(speed < 0.0, crossing, -jnp.inf)
+        face = jnp.where(inwards > enter, first + f, face)
+        enter = jnp.maximum(enter, inwards)
+        leave = jnp.minimum(leave, jnp.where(speed < 0.0, jnp.inf, crossing))
+    return enter, leave, face
 
 
 def world_half_spaces(polytopes: Polytopes) -> tuple[jax.Array, jax.Array]:
@@ -85,25 +120,27 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
     """
     normal, offset = world_half_spaces(polytopes)
     geoms, faces = offset.shape
-    table = ray_shapes.ray_plane(jnp.zeros(3), origin, direction)
+    falling = direction[2] < 0.0
+    down = -origin[2] / jnp.where(falling, direction[2], -1.0)  # to the table, z = 0
+    on_table = falling & (down >= 0.0)
 
     def fold_geom(nearest, geom):
         distance, surface = nearest
-        enter, face, valid = ray_shapes.enter_half_spaces(geom[0], geom[1], origin, direction)
+        enter, face, valid = enter_half_spaces(geom[0], geom[1], origin, direction)
         closer = valid & (enter < distance)
         surface = jnp.where(closer, geom[2] * faces + face + 1, surface)
         return (jnp.where(closer, enter, distance), surface), None
 
-    start = (jnp.where(table.valid, table.distance, jnp.inf), jnp.array(0, jnp.int32))
+    start = (jnp.where(on_table, down, jnp.inf), jnp.array(0, jnp.int32))
     rows = (normal, offset, jnp.arange(geoms, dtype=jnp.int32))
     (distance, surface), _ = jax.lax.scan(fold_geom, start, rows)
-    return SurfaceHit(distance, surface, table.valid | (surface > 0))
+    return SurfaceHit(distance, surface, on_table | (surface > 0))
 
 
 def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
     """Finds the first face of one object, leaves without the axis M; faces count from 0.
 
-    As `ray_shapes.enter_half_spaces`, but a part may span several chunks: a chunk with `first`
+    As `enter_half_spaces`, but a part may span several chunks: a chunk with `first`
     begins the next part.
     """
     chunks, faces = objects.offset.shape
@@ -118,7 +155,7 @@ def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) ->
         normal, offset, first, number = chunk
         nearest = ended(nearest, part, first)
         part = jax.tree.map(functools.partial(jnp.where, first), outside, part)
-        part = ray_shapes.clip(normal, offset, origin, direction, part, number * faces)
+        part = clip(normal, offset, origin, direction, part, number * faces)
         return (nearest, part), None
 
     far, no_face = jnp.float32(jnp.inf), jnp.int32(0)
@@ -163,24 +200,3 @@ def cast_windows(
 
     numbers = jnp.arange(len(corner), dtype=jnp.int32)
     return jax.lax.scan(fold_object, hits, (objects, corner, numbers))[0]
-
-
-def cast_solids(solids: Solids, origin: jax.Array, direction: jax.Array) -> Hit:
-    """Finds the first geom on the ray from `origin` [3] m along `direction` [3] of any length."""
-
-    def fold(nearest: Any, geom: GeomGroup) -> tuple[Any, None]:
-        offset = [origin[axis] - geom.position[axis] for axis in range(3)]
-        axes = geom.rotation.T
-        local = ([ray_shapes.dot(axis, part) for axis in axes] for part in (offset, direction))
-        entry = ray_shapes.RAY[geom.kind](geom.shape, *local)
-        normal = tuple(ray_shapes.dot(row, entry.normal) for row in geom.rotation)
-        closer = entry.valid & (entry.distance < nearest[0])
-        entered = (entry.distance, normal, geom.geom)
-        return jax.tree.map(functools.partial(jnp.where, closer), entered, nearest), None
-
-    zero = jnp.float32(0.0)
-    nearest: Any = (jnp.float32(jnp.inf), (zero, zero, zero), jnp.int32(-1))
-    for group in solids.groups:
-        nearest, _ = jax.lax.scan(fold, nearest, group)
-    distance, normal, geom = nearest
-    return Hit(distance, jnp.stack(normal), geom, geom >= 0)

@@ -1,16 +1,13 @@
-"""The pinhole camera's geometry and colours."""
+"""The pinhole camera's geometry."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 
 from csac_jax.config import CameraConfig
 from csac_jax.vision import camera
-from tests.vision import mujoco_rays
 
 
 def test_the_default_is_the_papers_camera():
@@ -40,25 +37,6 @@ def test_points_project_to_their_pixels(scale):
     # A pixel covers [i - 1/2, i + 1/2): scaling moves pixel centres accordingly.
     np.testing.assert_allclose((x / z * 600.0 + 330.5) * scale - 0.5, col, atol=2e-3)
     np.testing.assert_allclose((y / z * 620.0 + 236.5) * scale - 0.5, row, atol=2e-3)
-
-
-def test_colours_are_flat_shaded():
-    """Claim: a pixel is its geom's colour times a brightness by the normal, or SKY."""
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom type="box" size="0.1 0.1 0.1" rgba="0.2 0.4 0.8 1"/>'
-        "</worldbody></mujoco>"
-    )
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    eye = camera.make(CameraConfig().scaled(0.1))
-    picture = jax.device_get(jax.jit(camera.render)(eye, mujoco_rays.read(model, data)))
-    sky = ~picture.valid
-    assert picture.colour.shape == (48, 64, 3)
-    np.testing.assert_allclose(picture.colour[sky], np.tile(camera.SKY, (sky.sum(), 1)))
-    assert not picture.depth[sky].any()
-    levels = np.unique((picture.colour[~sky] / [0.2, 0.4, 0.8]).round(3))
-    # the side towards the camera faces away from the light, the top does not
-    np.testing.assert_allclose(levels, [0.4, 0.4 + 0.6 * 0.8], atol=2e-3)
 
 
 @pytest.mark.parametrize(

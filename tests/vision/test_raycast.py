@@ -1,7 +1,7 @@
 """The raycaster against C MuJoCo, and laws that hold for any scene."""
 
 import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,11 +15,20 @@ from csac_jax.vision import raycast
 _TABLE = -1  # geom
 
 
-def _cast_one(polytopes: raycast.Polytopes, origin: jax.Array, direction: jax.Array) -> raycast.Hit:
+class Hit(NamedTuple):
+    """First hit of one ray."""
+
+    distance: jax.Array  # [] in lengths of the direction
+    normal: jax.Array  # [3] of the surface
+    geom: jax.Array  # []
+    valid: jax.Array  # [] bool
+
+
+def _cast_one(polytopes: raycast.Polytopes, origin: jax.Array, direction: jax.Array) -> Hit:
     """`raycast.cast_polytopes` with the normal and the geom of the surface."""
     distance, surface, valid = raycast.cast_polytopes(polytopes, origin, direction)
     normal = raycast.surface_normals(polytopes)[surface]
-    return raycast.Hit(distance, normal, (surface - 1) // polytopes.offset.shape[1], valid)
+    return Hit(distance, normal, (surface - 1) // polytopes.offset.shape[1], valid)
 
 
 _cast_all = jax.jit(jax.vmap(_cast_one, in_axes=(None, 0, 0)))
@@ -55,11 +64,11 @@ def _random_scene(rng: np.random.Generator, geoms: int = 4, faces: int = 8) -> r
     return raycast.Polytopes(normal, offset, position, rotation, jnp.zeros((geoms, 3)))
 
 
-def _cast(polytopes: raycast.Polytopes, origin: np.ndarray, direction: np.ndarray) -> raycast.Hit:
+def _cast(polytopes: raycast.Polytopes, origin: np.ndarray, direction: np.ndarray) -> Hit:
     return _cast_all(polytopes, *(jnp.asarray(leaf, jnp.float32) for leaf in (origin, direction)))
 
 
-def _assert_same(hit: raycast.Hit, clear: np.ndarray, distance: Any, geom: Any) -> np.ndarray:
+def _assert_same(hit: Hit, clear: np.ndarray, distance: Any, geom: Any) -> np.ndarray:
     """Hits, geoms and distances of clear rays are C's; returns those that hit, [R] bool."""
     hit, met = jax.device_get(hit), clear & (geom > -2)
     np.testing.assert_array_equal(hit.valid[clear], geom[clear] > -2)
