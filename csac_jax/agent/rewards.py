@@ -35,11 +35,6 @@ def scale(cfg: RewardConfig, level: float) -> float:
     return cfg.eta[0] + cfg.eta[1] * 2.0 ** (level - cfg.grasp_level)
 
 
-def grasp_effect(cfg: RewardConfig, outcome: jax.Array) -> jax.Array:
-    """Returns I_g [] of `outcome` [] int32, eq. 15."""
-    return jnp.asarray(cfg.grasp_levels, jnp.float32).at[outcome].get(mode="clip")
-
-
 def push_effect(cfg: RewardConfig, good: jax.Array) -> jax.Array:
     """Returns I_c of pushes that are `good` or not, any shape, from `push_levels`."""
     worse, better = cfg.push_levels
@@ -58,7 +53,8 @@ def reward(cfg: RewardConfig, result: ActionResult) -> jax.Array:
     Deviation: the paper adds r1, which would reward distance. Ours: `lost_block_penalty`, once.
     """
     grasped = result.primitive == Primitive.GRASP
-    grasp = scale(cfg, cfg.grasp_level) * grasp_effect(cfg, result.outcome)
+    levels = jnp.asarray(cfg.grasp_levels, jnp.float32)  # I_g, eq. 15
+    grasp = scale(cfg, cfg.grasp_level) * levels.at[result.outcome].get(mode="clip")
     good = result.changed if cfg.push_label == "map_changed" else _gained(cfg, result)
     push = scale(cfg, cfg.push_level) * push_effect(cfg, good)
     lifted = grasped & (result.outcome == Outcome.LIFTED)

@@ -12,6 +12,7 @@ from csac_jax.cli import output, settings
 from csac_jax.cli.failures import check_extra, check_seed
 from csac_jax.errors import SettingsError
 from csac_jax.render import gl
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,8 +80,8 @@ def run(arguments: list[str]) -> int:
 
 def _check(options: PlayOptions) -> None:
     check_seed(options.seed)
-    if not all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size):
-        raise SettingsError("--size: both numbers must be even and lie in 16 .. 4096 px")
+    fits = all(side % 2 == 0 and 16 <= side <= 4096 for side in options.size)
+    require(fits, "--size: both numbers must be even and lie in 16 .. 4096 px")
     if options.viewer and not gl.has_display():
         check_extra("--viewer: there is no display here, and its page", "viser", "viewer")
     if options.png is None and options.video is None:

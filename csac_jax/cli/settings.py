@@ -74,7 +74,10 @@ def parse(
     description = None
     if parsing.SHORT_HELP.intersection(flags):
         description = _description(options, command, examples)
-        sections = {name: _shortened(sections[name], some) for name, some in FIRST.items()}
+        sections = {
+            name: _some(type(sections[name]), some)(**{k: getattr(sections[name], k) for k in some})
+            for name, some in FIRST.items()
+        }
     kind = _with_sections(options, {name: type(one) for name, one in sections.items()})
     default = kind(**sections, seed=base.seed, algo=base.algo)
     given = parsing.parse(kind, flags, command, default, description)
@@ -119,10 +122,6 @@ def _description(options: type, command: str, examples: Sequence[str]) -> str:
         "--help-all; below are those that people change first.",
     ]
     return "\n".join(lines)
-
-
-def _shortened(section: Any, some: Collection[str]) -> Any:
-    return _some(type(section), some)(**{name: getattr(section, name) for name in some})
 
 
 def _some(section: type, some: Collection[str], hint: str = "") -> Any:

@@ -19,6 +19,7 @@ from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import rollout, suites
 from csac_jax.evaluation.policies import Policy
 from csac_jax.io import checkpoint, files
+from csac_jax.section import require
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Callback, Record, RunInfo
 
@@ -38,8 +39,7 @@ class EvalPlan(NamedTuple):
     def check(self) -> None:
         """Raises SettingsError for numbers that cannot be, and for an unknown suite."""
         for name, value in (("eval_every", self.every), ("eval_episodes", self.episodes)):
-            if value < 1:
-                raise SettingsError(f"{name}: must be at least 1, not {value}")
+            require(value >= 1, f"{name}: must be at least 1, not {value}")
         suites.check(self.suite)
 
 

@@ -126,9 +126,9 @@ def _polytopes(model: mujoco.MjModel) -> tuple[np.ndarray, Polytopes]:
     no_material = model.geom_matid[:, None] < 0  # -1: the last row
     rgba: Any = np.where(no_material, model.geom_rgba, materials[model.geom_matid])
     shown = np.flatnonzero((rgba[:, 3] > 0.0) & (model.geom_type != _Geom.mjGEOM_PLANE))
-    hulls = [ConvexHull(_corners(model, geom)).equations.round(6) for geom in shown]
+    hulls = [ConvexHull(_corners(model, geom)).equations.round(6) for geom in map(int, shown)]
     hulls = [np.unique(hull, axis=0) for hull in hulls]  # triangles of one face
-    faces = np.zeros((len(hulls), max(map(len, hulls), default=1), 4), np.float32)
+    faces: Any = np.zeros((len(hulls), max(map(len, hulls), default=1), 4), np.float32)
     faces[..., 3] = -blocks.PADDING_OFFSET
     for row, hull in zip(faces, hulls, strict=True):
         row[: len(hull)] = hull

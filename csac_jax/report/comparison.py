@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from csac_jax.errors import SettingsError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import variants
 from csac_jax.report.results import Evaluation, RecordedRun, Results
 from csac_jax.report.variants import Variant, label
+from csac_jax.section import require
 
 REFERENCE = "csac_beta"  # algorithm that the others are compared with
 
@@ -144,10 +144,8 @@ def build(results: Results, reference: str | None = None) -> ResultReport:
         for key, group in grouped(results.evaluations, _score_key).items()
     ]
     algorithms = sorted({one.variant.algo for one in (*curves, *scores)})
-    if reference is not None and reference not in algorithms:
-        raise SettingsError(
-            f"no result of {reference}; there are: {', '.join(algorithms) or 'none'}"
-        )
+    known = ", ".join(algorithms) or "none"
+    require(reference in (None, *algorithms), f"no result of {reference}; there are: {known}")
     notes = [*results.notes, *(note for curve in curves for note in _curve_notes(curve))]
     return ResultReport(curves, scores, results, notes, reference or REFERENCE)
 

@@ -22,6 +22,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import files, renames
 from csac_jax.report import variants
 from csac_jax.report.variants import Json, Variant
+from csac_jax.section import require
 
 ARCHIVE = ".tar.xz"  # of folders of runs
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
@@ -140,10 +141,8 @@ def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> 
 
 
 def _files(path: Path) -> Iterator[Path]:
-    if not path.exists():
-        raise SettingsError(
-            f"there is no file or folder {path}; give folders of runs or eval results"
-        )
+    remedy = "give folders of runs or eval results"
+    require(path.exists(), f"there is no file or folder {path}; {remedy}")
     if path.is_file():
         yield path
     for folder, names, contents in os.walk(path):
@@ -249,9 +248,9 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
 
 def _check_part(part: Any) -> None:
     _check(part, _METRICS, "a part")
-    for share in [part[name] for name in METRICS if part.get(name)]:
-        if not _SHARE.keys() <= share.keys():
-            raise ValueError("a share lacks its interval")
+    shares = [part[name] for name in METRICS if part.get(name)]
+    if not all(_SHARE.keys() <= share.keys() for share in shares):
+        raise ValueError("a share lacks its interval")
 
 
 def _per_episode(metrics: Json) -> Json:

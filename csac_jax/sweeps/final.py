@@ -33,15 +33,12 @@ def measure(
         paths = {folder / run / name: cfg for run, cfg in runs.items()}
         if done := sum(path.exists() for path in paths):
             reporter.log(f"{point.name}: {done} policies have their {name} already")
-        left = {path: cfg for path, cfg in paths.items() if _is_left(path)}
+        saved = [path for path in paths if checkpoint.latest_step(path.parent) is not None]
+        left = {path: paths[path] for path in saved if not path.exists()}
         if left and stop.signal is None:
             reporter.log(f"evaluating {point.name}: {len(left)} policies")
             _measure_point(plan.episodes, suite, point.cfg, left, stop)
     return stop.signal
-
-
-def _is_left(path: Path) -> bool:
-    return not path.exists() and checkpoint.latest_step(path.parent) is not None
 
 
 def _measure_point(

@@ -13,6 +13,7 @@ from csac_jax.algorithms import unknown
 from csac_jax.config import ALTERNATIVES, Config, Section
 from csac_jax.errors import SettingsError
 from csac_jax.io import renames
+from csac_jax.section import require
 
 LONGEST = 120  # characters of a point's name, which is a folder's
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen
@@ -89,17 +90,15 @@ def _axis(text: str) -> tuple[str, list[str]]:
     values = [renames.current_setting(name, value)[1] for value in values]
     name, _ = renames.current_setting(name, values[0])
     kind_of(name)
-    if len(set(values)) < len(values):
-        raise SettingsError(f"vary {text}: a value is given twice")
-    if not all(map(_VALUE.fullmatch, values)):
-        raise SettingsError(f"vary {text}: a value holds no slash and begins with no dot or dash")
+    require(len(set(values)) == len(values), f"vary {text}: a value is given twice")
+    form = "a value holds no slash and begins with no dot or dash"
+    require(all(map(_VALUE.fullmatch, values)), f"vary {text}: {form}")
     return name, values
 
 
 def kind_of(name: str) -> object:
     """Returns the type of a setting by its dotted name; SettingsError if it cannot be varied."""
-    if name == "seed":
-        raise SettingsError("vary: leave seed out; give the number of seeds")
+    require(name != "seed", "vary: leave seed out; give the number of seeds")
     kinds: dict[str, object] = {"algo": str, **dict.fromkeys(BUNDLES, str)}
     for section, default in vars(Config()).items():
         alternatives: Any = ALTERNATIVES.get(section, ("", (type(default),)))[1]
@@ -117,8 +116,7 @@ def settings_of(name: str, value: Any) -> dict[str, Any]:
     """Returns the settings that a varied name stands for: those of a bundle, or itself."""
     if name not in BUNDLES:
         return {name: value}
-    if value not in BUNDLES[name]:
-        raise SettingsError(unknown(name, value, BUNDLES[name]))
+    require(value in BUNDLES[name], unknown(name, str(value), BUNDLES[name]))
     return BUNDLES[name][value]
 
 
@@ -128,8 +126,8 @@ def _flags(name: str, value: str) -> list[str]:
         return [flag for key, item in settings.items() for flag in _flags(key, _text(item))]
     flag = "--" + name.replace("_", "-")
     if kind_of(name) is bool:
-        if value not in ("true", "false"):
-            raise SettingsError(f"vary {name}: {value!r} is neither true nor false")
+        is_bool = value in ("true", "false")
+        require(is_bool, f"vary {name}: {value!r} is neither true nor false")
         section, _, field = flag.rpartition(".")
         return [flag if value == "true" else f"{section}.no-{field}"]
     items = value.split(":") if typing.get_origin(kind_of(name)) is tuple else [value]

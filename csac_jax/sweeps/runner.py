@@ -30,6 +30,7 @@ from csac_jax.evaluation.metrics import NO_CASES
 from csac_jax.io import checkpoint, configs, files, lock, renames
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
+from csac_jax.section import require
 from csac_jax.sweeps import grid
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory
@@ -144,15 +145,13 @@ def check_plan(plan: SweepPlan) -> None:
     """Raises SettingsError for too many runs or episodes, or an unsafe folder name."""
     if type(plan.seeds) is not int or not 1 <= plan.seeds * len(plan.points) <= grid.MOST_RUNS:
         raise SettingsError(f"seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
-    if type(plan.episodes) is not int or not 0 <= plan.episodes <= MOST_EPISODES:
-        raise SettingsError(f"episodes: 0 to {MOST_EPISODES}")
+    fits = type(plan.episodes) is int and 0 <= plan.episodes <= MOST_EPISODES
+    require(fits, f"episodes: 0 to {MOST_EPISODES}")
     for name in (names := [point.name for point in plan.points]):
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
             raise SettingsError(f"{shown(name)} is no name of a folder")
-        if name in RESERVED:
-            raise SettingsError(f"the name '{name}' is taken by the sweep's own files")
-    if len(set(names)) < len(names):
-        raise SettingsError("two settings have the same name")
+        require(name not in RESERVED, f"the name '{name}' is taken by the sweep's own files")
+    require(len(set(names)) == len(names), "two settings have the same name")
 
 
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:

@@ -62,22 +62,6 @@ def _dot(a: Vector, b: Vector) -> jax.Array:
     return functools.reduce(jnp.add, (a[axis] * b[axis] for axis in range(len(a))))
 
 
-def enter_half_spaces(
-    normal: jax.Array, offset: jax.Array, origin: Vector, direction: Vector
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Intersects one ray with half-spaces, normals [F, 3] and offsets [F] m (slab method, Kay and
-    Kajiya 1986). Returns distance, face int32 and bool, the ray enters, all [].
-
-    t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
-    leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
-    never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
-    that share a direction share the division.
-    """
-    whole = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
-    enter, leave, face = clip(normal, offset, origin, direction, whole, 0)
-    return enter, face, (enter >= 0.0) & (enter <= leave)
-
-
 def clip(
     normal: jax.Array,
     offset: jax.Array,
@@ -86,7 +70,14 @@ def clip(
     part: tuple[jax.Array, jax.Array, jax.Array],
     first: jax.Array | int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Cuts a ray's part (enter, leave, face), all [], by half-spaces, numbered from `first`."""
+    """Cuts a ray's part (enter, leave, face), all [], by half-spaces, normals [F, 3] and offsets
+    [F] m, numbered from `first` (slab method, Kay and Kajiya 1986).
+
+    t = (offset - n . o) / (n . d) at each plane. The ray enters at the largest t with n . d < 0 and
+    leaves at the smallest with n . d > 0. A parallel plane is left at t = +-1e30 (offset - n . o):
+    never if the origin is inside or on it, at once if outside. 1 / (n . d) is computed first: rays
+    that share a direction share the division.
+    """
     enter, leave, face = part
     for f in range(normal.shape[0]):
         speed = _dot(normal[f], direction)
@@ -124,12 +115,14 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
     down = -origin[2] / jnp.where(falling, direction[2], -1.0)  # to the table, z = 0
     on_table = falling & (down >= 0.0)
 
+    whole = jnp.float32(-jnp.inf), jnp.float32(jnp.inf), jnp.int32(0)
+
     def fold_geom(nearest, geom):
         distance, surface = nearest
-        enter, face, valid = enter_half_spaces(geom[0], geom[1], origin, direction)
-        closer = valid & (enter < distance)
-        surface = jnp.where(closer, geom[2] * faces + face + 1, surface)
-        return (jnp.where(closer, enter, distance), surface), None
+        part = clip(geom[0], geom[1], origin, direction, whole, geom[2] * faces + 1)
+        enter, leave, face = part
+        closer = (enter >= 0.0) & (enter <= leave) & (enter < distance)
+        return (jnp.where(closer, enter, distance), jnp.where(closer, face, surface)), None
 
     start = (jnp.where(on_table, down, jnp.inf), jnp.array(0, jnp.int32))
     rows = (normal, offset, jnp.arange(geoms, dtype=jnp.int32))
@@ -140,8 +133,7 @@ def cast_polytopes(polytopes: Polytopes, origin: jax.Array, direction: jax.Array
 def cast_body(objects: ObjectShapes, origin: jax.Array, direction: jax.Array) -> SurfaceHit:
     """Finds the first face of one object, leaves without the axis M; faces count from 0.
 
-    As `enter_half_spaces`, but a part may span several chunks: a chunk with `first`
-    begins the next part.
+    A part may span several chunks: a chunk with `first` begins the next part.
     """
     chunks, faces = objects.offset.shape
 
