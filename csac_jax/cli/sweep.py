@@ -37,7 +37,7 @@ class SweepOptions:
     anywhere, oblique, noisy, ur5, together), and its values. Every combination is run. Colons
     separate a tuple's items: replay.end=1:4,1:12."""
     evaluate: int = 0
-    """Episodes to evaluate every final policy in, for the sweep's study.md and study.png."""
+    """Episodes to evaluate every final policy in, for the tables of the sweep's study.md."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
@@ -103,15 +103,12 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
 
 
 def _write_study(folder: Path) -> None:
-    from csac_jax.report import comparison, figures, result_tables, results, study
+    from csac_jax.report import comparison, result_tables, results
 
-    report = comparison.build(results.read([folder]))
-    page, picture = folder / "study.md", folder / "study.png"
+    tables = result_tables.markdown(comparison.build(results.read([folder])))
     head = f"# Study\n\nWritten by `{PROGRAM} sweep --resume {folder}`.\n\n"
-    table = result_tables.table_text(study.table(report))
-    files.replace(page, f"{head}{result_tables.EXPLAINED}\n\n{table}\n")
-    figures.save(figures.study(study.rows(report)), picture)
-    print(f"table and figure: {page}, {picture}")
+    files.replace(folder / "study.md", head + tables)
+    print(f"tables: {folder / 'study.md'}")
 
 
 def read(arguments: list[str]) -> tuple[SweepOptions, Any]:

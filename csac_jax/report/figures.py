@@ -1,6 +1,5 @@
-"""Figures of a report: training curves, suites, performance profiles, a sweep's methods."""
+"""Figures of a report: training curves, suites, performance profiles."""
 
-import itertools
 import textwrap
 from collections.abc import Iterator, Sequence
 from io import BytesIO
@@ -18,7 +17,6 @@ from matplotlib.figure import Figure
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report.comparison import Curve, ResultReport, Score, grouped
-from csac_jax.report.study import PANELS, StudyRow
 from csac_jax.report.variants import NAMES, Variant, label
 
 PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7")
@@ -177,33 +175,6 @@ def _style(scores: Sequence[Score], index: int) -> dict[str, Any]:
     colour = _colour([other.variant.algo for other in scores], index)
     name = f"{', '.join(words)} ({score.most_runs})"
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
-
-
-def study(rows: Sequence[StudyRow]) -> Figure:
-    """Draws metrics of a sweep's policies against actions: a column per task, a line a method."""
-    by_task = grouped(rows, lambda row: row.task)
-    size, shape = (1.0 + 3.6 * len(by_task), 2.6 * len(PANELS)), (len(PANELS), len(by_task))
-    figure, panels = plt.subplots(
-        *shape, figsize=size, sharex=True, sharey="row", squeeze=False, layout="constrained"
-    )
-    for column, (task, of_task) in zip(panels.T, by_task.items(), strict=True):
-        for panel, metric in zip(column, PANELS, strict=True):
-            _study_lines(panel, metric, of_task)
-        column[0].set_title(task)
-        column[-1].set_xlabel("actions of training")
-    for panel, title in zip(panels[:, 0], PANELS.values(), strict=True):
-        panel.set_ylabel(f"{title}, %")
-    _legend_below(figure, panels[0, 0])
-    return figure
-
-
-def _study_lines(panel: Axes, metric: str, rows: Sequence[StudyRow]) -> None:
-    spare = itertools.cycle(PALETTE)
-    for method, of_method in grouped(rows, lambda row: row.method).items():
-        named = COLOURS.get(of_method[0].score.variant.algo) if "," not in method else None
-        bands = [row.score.band(metric) for row in of_method]
-        style = {"color": named or next(spare), "marker": "o", "label": method}
-        _shaded(panel, [row.actions for row in of_method], bands, **style)
 
 
 def percent(bands: Sequence[Band | None]) -> np.ndarray:
