@@ -25,7 +25,7 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
-from csac_jax.training import programs, split_step, step, trace_cache, transitions
+from csac_jax.training import loop, programs, split_step, step, trace_cache, transitions
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation
@@ -374,6 +374,22 @@ def test_ill_scenes_leave_no_trace(run):
     assert int(state.replay.size) == NUM_SEEN - int(np.sum(metrics.physics_diverged))
     for name, leaf in leaves(state):
         assert np.issubdtype(leaf.dtype, np.integer) or np.all(np.isfinite(leaf)), name
+
+
+@pytest.mark.parametrize("part", ["reward", "critic_optimiser", "online", "target"])
+def test_nan_is_reported_at_once(run, part: str):
+    """Claim: NaN in the rewards that are learned from, in what Adam keeps of a gradient, or in a
+    network is found in the metrics of the chunk that it reaches."""
+    lose = lambda leaf: jnp.full_like(leaf, jnp.nan) if leaf.dtype == jnp.float32 else leaf  # noqa: E731
+    state = copy(run.states[1])
+    if part == "reward":
+        items = state.replay.items.replace(reward=lose(state.replay.items.reward))
+        state = state.replace(replay=state.replay.replace(items=items))
+    else:
+        lost = {part: jax.tree.map(lose, getattr(state.learner, part))}
+        state = state.replace(learner=state.learner.replace(**lost))
+    assert loop.not_finite(run.metrics[1]) is None
+    assert loop.not_finite(jax.device_get(run.chunk(state)[1]))
 
 
 @pytest.mark.parametrize("sampler", ["prioritised", "beta"])
