@@ -55,7 +55,6 @@ def draw() -> Iterator[tuple[str, Figure]]:
     yield "replay", replay()
     yield from steps()
     yield from sweeps()
-    yield "warp-action", warp_action()
     for chart in figures.draw(comparison.build(results.read([RESULTS]))):
         yield chart.name, _with_paper(chart)
     for chart in figures.draw(_target()):
@@ -159,37 +158,6 @@ def sweeps() -> Iterator[tuple[str, Figure]]:
         _finish(panel)
     yield "step-seeds", seeds
     yield "step-devices", devices
-
-
-def warp_action() -> Figure:
-    """Draws actions a second on Warp against scenes, blocks and convex parts of objects."""
-    (objects,) = _read("objects", "h100")
-    rows = [row for record in _read("warp_action", "^h100-[0-9bs]") for row in record["runs"]]
-    per_second = {(row["scenes"], row["blocks"]): row["actions_per_second"] for row in rows}
-    milliseconds = {
-        objects["mean_parts"][kind]: objects["milliseconds"][f"{kind} action"]
-        for kind in objects["mean_parts"]
-        if kind != "objects"
-    }
-    curves = {
-        "scenes of ten blocks": {e: rate for (e, n), rate in per_second.items() if n == 10},
-        "blocks in each of 2,048 scenes": {
-            n: rate for (e, n), rate in per_second.items() if e == 2048
-        },
-        f"convex parts an object, {objects['scenes']:,} scenes": {
-            parts: 1e3 / time for parts, time in milliseconds.items()
-        },
-    }
-    figure, panels = plt.subplots(1, 3, figsize=(11, 3.2), sharey=True, layout="constrained")
-    for panel, (label, points) in zip(panels, curves.items(), strict=True):
-        panel.plot(*zip(*sorted(points.items()), strict=True), "o-")
-        panel.set(xlabel=label, ylim=(0, None))
-        panel.grid(alpha=0.3)
-    panels[0].set_xscale("log", base=2)
-    panels[0].xaxis.set_major_formatter("{x:,g}")
-    panels[1].xaxis.set_major_locator(ticker.MaxNLocator(integer=True))
-    panels[0].set_ylabel("actions a second")
-    return figure
 
 
 def _name(record: dict[str, Any]) -> str:

@@ -48,15 +48,6 @@ def test_sizes_stay_the_presets(name):
     assert before.replay.capacity == after.replay.capacity
 
 
-def test_vpg_by_hand():
-    """Claim: VPG's numbers: discount 0.5, primitive at random 0.5 -> 0.1, half of those pushes,
-    maximum over pixels by the network itself, no actor."""
-    cfg = algorithms.configure(presets.quick(), "vpg")
-    assert (cfg.target.gamma, cfg.target.value, cfg.policy.place) == (0.5, "max", "argmax")
-    assert (cfg.explore.epsilon_primitive, cfg.explore.push_fraction) == ((0.5, 0.1), 0.5)
-    assert (cfg.learn.tau, cfg.learn.actor) == (1.0, False)
-
-
 @pytest.mark.parametrize("preset", list(presets.PRESETS))
 def test_vpg_as_its_authors_have_it(preset):
     """Claim: VPG bootstraps as in its code and replays opposite outcomes, by the power law; all

@@ -208,20 +208,6 @@ def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
     np.testing.assert_array_equal(ends.done, np.arange(SCENES) == 0)
 
 
-def test_next_target_in_the_same_scene(lab: Lab, stepped: State):
-    """Claim: after a target comes another in the same scene, after other ends a fresh scene."""
-    cfg = dataclasses.replace(CONFIG, task=TaskConfig(kind="target"))
-    env = dataclasses.replace(lab.env, cfg=cfg)
-    fresh = jax.jit(jax.vmap(env.auto_reset))(jax.random.split(jax.random.key(0), SCENES), stepped)
-    for name, stays in (("got", True), ("wrong", False), ("last chance", False)):
-        new, old = (_at(state, list(_CASES).index(name)) for state in (fresh, stepped))
-        assert np.array_equal(new.scene.position, old.scene.position) == stays, name
-        assert new.scene.in_play[new.scene.target], name
-        assert (new.done, new.reward, new.actions) == (False, 0.0, 0)
-        assert new.obs.target.any()
-        assert not new.obs.target.all()
-
-
 def _in_c(lab: Lab, **changes: Any) -> Env:
     cfg = CONFIG.change(sim={"physics": "c"})  # which compiles sooner
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)

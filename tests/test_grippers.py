@@ -5,15 +5,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax import deploy, grippers
-from csac_jax.deploy import decision
+from csac_jax import grippers
 from csac_jax.errors import SettingsError
-from csac_jax.robot.primitives import Action
 
 RG2 = grippers.load("rg2")
 
@@ -120,17 +117,3 @@ def test_no_gripper_is_one_line(source: str):
     message = f"neither one of {', '.join(grippers.shipped())} nor a folder"
     with pytest.raises(SettingsError, match=message):
         grippers.load(source)
-
-
-@pytest.mark.mjx
-def test_deployed_policy_takes_another_gripper():
-    """Claim: a deployed policy decides for the gripper that it is given, its own by default."""
-    assert deploy.CameraPolicy.load("shipped").cfg.sim.gripper == "rg2"
-    policy = deploy.CameraPolicy.load("shipped", gripper="2f85")
-    height = jnp.zeros((policy.cfg.heightmap.size,) * 2)
-    stations = decision.stations(policy.cfg, height, Action.grasp(0.0, 0.0, 0.0))
-    choice = decision.Choice(Action.grasp(0.0, 0.0, 0.0), jnp.zeros(()), jnp.bool(True), stations)
-    decided = decision.from_choice(jax.device_get(choice), np.eye(4))
-    assert decided.width == pytest.approx(0.085)
-    with pytest.raises(SettingsError, match="neither one of"):
-        deploy.CameraPolicy.load("shipped", gripper="2f86")

@@ -219,10 +219,6 @@ def test_training_in_c_needs_no_mjx():
     [
         ("vision/a.py", "from csac_jax.training import loop", "training is imported"),
         ("vision/a.py", "def f():\n    import csac_jax.env", "env is imported"),
-        ("config.py", "from csac_jax import geometry", "geometry is imported"),
-        ("training/a.py", "from csac_jax.report import tables", "report is imported"),
-        ("api.py", "from csac_jax.cli import settings", "cli is imported"),
-        ("cli/a.py", "from csac_jax import __main__", "__main__ is imported"),
         ("render/a.py", "import tyro", "tyro is imported"),
         ("training/a.py", "from . import loop", "relative import"),
         ("agent/a.py", "from mujoco import mjx", "mujoco is imported"),
@@ -230,7 +226,6 @@ def test_training_in_c_needs_no_mjx():
         ("agent/a.py", "import flax\nx = flax.linen.Dense", "flax.linen is used"),
         ("agent/a.py", "import jax\n@jax.jit\ndef f(x): return x", "jax.jit is used"),
         ("world/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
-        ("sim/a.py", "print(1)", "print is used"),
         ("nets/a.py", "import jax\njax.debug.print('x')", "jax.debug.print is used"),
         ("replay/a.py", "open('x')", "open is used"),
         ("vision/a.py", "from pathlib import Path", "pathlib is imported"),
@@ -281,12 +276,9 @@ def test_nothing_is_executed():
 @pytest.mark.parametrize(
     "source",
     [
-        "import pickle",
         "from pickle import loads",
         "import yaml as y\ny.load(f)",
-        "import yaml\nyaml.unsafe_load(f)",
         "from yaml import load",
-        "eval('1')",
         "x = exec",
         "from os import system\nsystem('ls')",
         "import subprocess\nsubprocess.run('ls', shell=x)",

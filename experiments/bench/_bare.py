@@ -9,9 +9,7 @@ import jax
 import mujoco
 import numpy as np
 
-from csac_jax.baselines import oracle
 from csac_jax.config import Config
-from csac_jax.env import Env, State
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action, JointTrajectory
 from csac_jax.sim import mjx_physics
@@ -24,15 +22,6 @@ from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 
 AT_ONCE = 128  # scenes; XLA wants gigabytes for thousands
-
-
-def grasping(cfg: Config, env: Env, scenes: int) -> tuple[State, Action, JointTrajectory]:
-    """Returns first states of scenes, planned grasps and joint trajectories; leaves [E, ...]."""
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), scenes))
-    grasp = functools.partial(oracle.grasp, cfg)
-    planned = functools.partial(jax.lax.map, lambda row: grasp(*row), batch_size=AT_ONCE)
-    actions = jax.jit(planned)((states.scene, states.obs.height))
-    return states, actions, joint_trajectories(cfg, states.obs.height, actions)
 
 
 def joint_trajectories(cfg: Config, height: jax.Array, actions: Action) -> JointTrajectory:

@@ -13,7 +13,6 @@ from csac_jax.constants import Primitive
 from csac_jax.nets import dense, networks
 from csac_jax.robot import primitives
 from csac_jax.sim.outcome import BARE
-from csac_jax.vision import rotate
 from csac_jax.vision.heightmap import Observation
 
 GRASP, PUSH = int(Primitive.GRASP), int(Primitive.PUSH)
@@ -50,17 +49,6 @@ def test_reading_at_a_cells_pose_gives_the_cell(frames):
         assert_allclose(got, values[p].reshape(-1), atol=1e-4)
 
 
-def test_cell_below_a_cells_pose_is_the_cell(frames):
-    """Claim: rounding puts no cell's own pose into the cell or frame before it."""
-    side, yaws = frames.side, jnp.asarray(frames.yaws)
-    to_cell = jax.vmap(rotate.to_cell, (None, None, 0, 0))
-    position = to_cell(side, frames.cell, yaws, jnp.asarray(frames.xy))
-    cells = np.broadcast_to(np.mgrid[:side, :side].transpose(1, 2, 0), position.shape)
-    assert_array_equal(rotate.floor(position), cells)
-    assert_array_equal(rotate.floor(maps.yaw_index(frames, yaws)), np.arange(len(yaws)))
-    assert_array_equal(rotate.floor(position + 0.99), cells)
-
-
 def test_is_valid_at_a_cells_pose_is_the_cell(frames):
     """Claim: `is_valid` looks at the nearest cell, also a third of a cell and of a yaw step off."""
     valid, poses = _random_maps(frames) > 0.0, _cell_poses(frames)
@@ -88,47 +76,6 @@ def test_read_is_linear_in_yaw_and_wraps(frames):
     poses = np.stack([np.full_like(yaw, 0.05), np.full_like(yaw, -0.1), yaw], axis=1)
     wanted = np.interp(yaw, frames.yaws, per_yaw, period=2.0 * np.pi)
     assert_allclose(_read(frames, values, PUSH, poses), wanted, atol=1e-5)
-
-
-def test_read_is_trilinear_by_hand(frames):
-    """Claim: between cells and yaws the weights are products."""
-    values = np.asarray(_random_maps(frames, 4))
-    k, row, col = 0, 7, 5
-    pose = np.append(frames.xy[k, row, col] + frames.cell * np.array([0.25, 0.5]), 0.0)
-    step = np.array([0.0, 0.0, 2.0 * np.pi / frames.yaws.size])
-    poses = np.stack([pose, pose + step, pose + 0.2 * step])
-    here, following, between = _read(frames, values, GRASP, poses)
-    corner = values[GRASP, k, row : row + 2, col : col + 2]
-    assert_allclose(here, np.array([0.5, 0.5]) @ corner @ np.array([0.75, 0.25]), atol=1e-5)
-    assert_allclose(between, 0.8 * here + 0.2 * following, atol=1e-5)
-
-
-def test_gradient_of_read(frames):
-    """Claim: the gradient in x, y and yaw is that of finite differences inside of a cell."""
-    values, poses = _random_maps(frames, 5), _poses(400, 0.2, seed=6)
-    gradient = jax.vmap(jax.grad(lambda pose: maps.read(frames, values, jnp.int32(PUSH), pose)))
-    got = np.asarray(jax.jit(gradient)(jnp.asarray(poses, jnp.float32)))
-    checked = 0
-    for axis, step in enumerate((0.05 * frames.cell, 0.05 * frames.cell, 0.02)):
-        above, below = (poses + sign * step * np.eye(3)[axis] for sign in (1.0, -1.0))
-        same = np.all(_cells(frames, above) == _cells(frames, below), axis=1)
-        high, low = (_read(frames, values, PUSH, at[same]) for at in (above, below))
-        wanted = (high - low) / (2.0 * step)
-        assert_allclose(got[same, axis], wanted, atol=2e-3 * np.abs(wanted).mean(), rtol=2e-3)
-        checked += same.sum()
-    assert checked > 600
-
-
-def _cells(frames: maps.Frames, poses: np.ndarray) -> np.ndarray:
-    """Lower yaw, and lower cells in both frames next to it, of poses [n, 3]: [n, 5]."""
-    x, y, yaw = poses.T
-    lower, middle = np.floor(yaw * frames.yaws.size / (2.0 * np.pi)), 0.5 * (frames.side - 1)
-    columns = [lower]
-    for k in (lower, lower + 1):
-        cos, sin = (f(2.0 * np.pi * k / frames.yaws.size) for f in (np.cos, np.sin))
-        for along in (cos * x + sin * y, cos * y - sin * x):
-            columns.append(np.floor(along / frames.cell + middle))
-    return np.stack(columns, axis=1)
 
 
 def test_unfolding(frames):

@@ -18,7 +18,6 @@ from tests.deploy import scenes
 POSES = np.array([[0.1, 0.09, 0.4], [-0.1, 0.0, 1.0], [0.06, -0.1, 2.0]])
 SHAPES = scenes.blocks_at(POSES)
 IMAGE = scenes.take(SHAPES)
-BARE_TABLE = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
 WORKSPACE = np.array([[0, -1, 0, 0.4], [1, 0, 0, -0.2], [0, 0, 1, 0.05], [0, 0, 0, 1]], float)
 
 
@@ -154,18 +153,12 @@ def test_misfit_is_refused(policy: CameraPolicy):
             policy.decide(*IMAGE, top=top)
 
 
-def test_report_of_the_empty_table(policy: CameraPolicy):
-    """Claim: the check measures the table's height and what lies on it; two blocks of 10 x 5 cm
-    cover at least their 100 cm^2."""
-    pose = IMAGE.pose.copy()
-    pose[2, 3] += 0.006
-    empty = policy.check(*BARE_TABLE._replace(pose=pose))
-    assert empty.height_mm == pytest.approx(6.0, abs=0.1)
-    assert empty.tilt_deg < 0.05
-    assert empty.seen == 1.0
-    assert empty.covered_cm2 == 0.0
-    two = policy.check(*scenes.take(scenes.blocks_at(POSES[:2])))
-    assert 100.0 <= two.covered_cm2 < 200.0
+def test_robot_may_have_another_gripper(decisions: list[Decision]):
+    """Claim: a policy decides for the gripper that it is given, by default for its own."""
+    other = CameraPolicy.load("shipped", gripper="2f85").decide(*IMAGE)[0]
+    assert (decisions[0].width, other.width) == pytest.approx((0.11, 0.085))
+    with pytest.raises(SettingsError, match="neither one of"):
+        CameraPolicy.load("shipped", gripper="2f86")
 
 
 def test_net_of_heights_sees_no_colours():

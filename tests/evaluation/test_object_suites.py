@@ -12,16 +12,6 @@ pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 SMOKE = presets.smoke()
 
 
-def test_a_library_fits_the_suite():
-    """Claim: a suite of objects without a library, and a library for another suite, are refused."""
-    for suite, objects, message in (
-        ("pile", None, "objects: pile needs a library"),
-        ("random10", "procedural:0:20", "'random10' has no objects of a library; pile"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            suites.prepare(SMOKE, suite, objects=objects)
-
-
 @pytest.mark.slow
 def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_path):
     """Claim: episodes of a pile end empty or after two failures in a row; the result has the

@@ -168,16 +168,6 @@ def test_batches_do_not_matter(magnet, random, monkeypatch):
 
 
 @pytest.mark.slow
-def test_endings_by_hand(magnet):
-    """Claim: with two actions at most, scenes of two blocks are cleared and those of three are cut
-    off by that cap."""
-    cfg = dataclasses.replace(CFG, task=ShortTask(max_actions=2))
-    short = Magnet(cfg, magnet.physics, magnet.scenes)
-    episodes = rollout.rollout(short, OraclePolicy(cfg), EPISODES, 0)
-    np.testing.assert_array_equal(episodes.ending, np.where(_blocks(magnet) == 2, 0, 1))
-
-
-@pytest.mark.slow
 def test_networks_are_arguments(magnet):
     """Claim: other weights of the same networks compile nothing again, and act otherwise."""
     strong = StrongMagnet(magnet.cfg, magnet.physics, magnet.scenes)

@@ -2,28 +2,19 @@
 
 import contextlib
 import functools
-import itertools
 import os
 import re
 import shutil
 import subprocess
 import tempfile
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from unittest import mock
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from csac_jax import presets
 from csac_jax.errors import DataWarning
-from csac_jax.io import checkpoint, files
-from csac_jax.sweeps import runner
-from csac_jax.sweeps.grid import SweepPoint
-from csac_jax.training import loop, programs, step
+from csac_jax.io import checkpoint
 from tests.faults import harness, toy, toy_cli
 from tests.faults.harness import MissingToolError, Tally, fault
 
@@ -299,26 +290,6 @@ def two_at_once(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
         run.judge(first, about, kill=True)
 
 
-@fault("clock that goes backwards", tries=10)
-def clock(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Turns the wall clock back at each look; the run continues and its log is whole."""
-    reference = toy.Reference()
-    for number in tally.each(range(tries)):
-        run_dir, about = folder / str(number), f"try {number}"
-
-        def twice(run_dir: Path = run_dir) -> None:
-            toy.train(run_dir, 2)
-            toy.train(run_dir, 2, resume=True)
-
-        now = itertools.accumulate(rng.exponential(600.0, 100_000), lambda a, b: a - b, initial=2e9)
-        with mock.patch.object(time, "time", functools.partial(next, now)):
-            harness.works(tally, about, twice, "tracebacks")
-        tally.sound(toy.fault_of(run_dir, reference, 4), "lost", about)
-        seconds = [line["seconds"] for line in files.read_log(run_dir / "metrics.jsonl")]
-        rising = min(seconds) >= 0.0 and seconds == sorted(seconds)
-        tally.check(rising, "silent", f"{about}: the log's seconds are {seconds}")
-
-
 @fault("read-only folders", tries=12)
 def read_only(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     """Closes folders to a run; it says so in one line and changes nothing."""
@@ -393,119 +364,3 @@ def _with_stdout(end: str, run_dir: Path, result: Path, steps: int) -> harness.A
         process.stdout.close()
         process.stdout = None
     return harness.wait(process, WORK)
-
-
-PROGRAMS = {
-    "import in a thread": """
-import threading
-from pathlib import Path
-def work():
-    from tests.faults import toy
-    print([toy.train(Path({run!r}), 2).step])
-thread = threading.Thread(target=work)
-thread.start()
-thread.join()
-""",
-    "fork before": """
-import os
-from pathlib import Path
-from tests.faults import toy
-if os.fork() == 0:
-    toy.train(Path({run!r}), 2)
-    os._exit(0)
-print([2] if os.wait()[1] == 0 else os.wait())
-""",
-    "fork after": """
-import os
-from pathlib import Path
-from tests.faults import toy
-print([toy.train(Path({run!r}), 2).step], flush=True)
-if os.fork() == 0:
-    os._exit(0)
-assert os.wait()[1] == 0
-toy.train(Path({run!r}), 1, resume=True)
-""",
-}
-
-
-@fault("fork, and import in a thread", tries=6)
-def fork_and_thread(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Trains in a thread that imports the package, in a child forked before JAX, after a fork."""
-    for number in tally.each(range(tries)):
-        about, source = list(PROGRAMS.items())[number % len(PROGRAMS)]
-        run_dir = folder / str(number)
-        answer = harness.wait(harness.start(["-c", source.format(run=str(run_dir))]), WORK)
-        harness.judge(tally, answer, about)
-        done = answer.code == 0 and "[2]" in answer.output
-        tally.check(done, "lost", f"{about}: {answer.code} {answer.errors[-300:]!r}")
-        if done:
-            tally.sound(toy.fault_of(run_dir, toy.Reference(), 2), "lost", about)
-
-
-VICTIMS = (
-    *("../victim", "..", ".", "", "/", "../victim/", "a/../../victim", "{root}/victim", "a\0b"),
-    *(None, 7, ["a"], "groups", "sweep.json", "link", "..\\victim"),
-)
-
-
-@fault("names of sweeps that lead elsewhere", tries=len(VICTIMS))
-def sweep_names(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Reads a sweep.json with such a name: it is refused, and nothing elsewhere changes."""
-    for name in tally.each(_chosen(rng, list(VICTIMS), tries)):
-        own = folder / str(tally.tries)
-        victim, sweep = own / "victim", own / "sweep"
-        for seed in (5, 6):
-            toy.train(victim / f"seed-{seed}", 3, seed=seed)
-        sweep.mkdir()
-        (sweep / "link").symlink_to(victim)
-        before = _content(victim)
-        shown = name.format(root=own) if isinstance(name, str) else name
-        point = SweepPoint(shown, {}, toy.config())  # type: ignore[arg-type]
-        (sweep / "sweep.json").write_text(runner.plan_text(runner.SweepPlan(2, [point])))
-        read = functools.partial(runner.read_plan, sweep)
-        harness.refused(tally, f"name {name!r}", read, runner.SweepError)
-        tally.check(_content(victim) == before, "lost", f"name {name!r}: the victim has changed")
-
-
-@fault("NaN in a reward, a gradient or a weight", tries=20, slow=True)
-def nan_in_training(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
-    """Spoils replay or learner of the real step: NaN in the networks is reported at once."""
-    cfg = presets.smoke().change(
-        sim={"physics": "c"}, replay={"capacity": 64}, train={"scenes": 8, "learning_starts": 8}
-    )
-    program = programs.make(cfg)
-    start = programs.init(program)
-    compiled = programs.compile_chunk(program, 1).lower(start).compile()
-    start, _ = compiled(start)
-    for number in tally.each(range(tries)):
-        kind = ("reward", "gradient", "weight")[number % 3]
-        state, problem = _poisoned(rng, jax.tree.map(jnp.copy, start), kind), None
-        for _ in range(100 if kind == "reward" else 1):  # until it is drawn
-            state, metrics = compiled(state)
-            if problem := loop.not_finite(jax.device_get(metrics)):
-                break
-        lost = [leaf for leaf in jax.tree.leaves(state.learner) if not _finite(leaf)]
-        text = f"NaN in a {kind}: {problem}, {len(lost)} leaves lost"
-        tally.check(problem is not None and lost, "silent", text)
-
-
-def _finite(leaf: jax.Array) -> bool:
-    is_float = jnp.issubdtype(leaf.dtype, jnp.floating)
-    return not is_float or bool(jnp.isfinite(leaf).all())
-
-
-def _poisoned(rng: Rng, state: step.TrainState, kind: str) -> step.TrainState:
-    if kind == "reward":
-        items = state.replay.items
-        items = items.replace(reward=items.reward.at[int(rng.integers(8)) :].set(jnp.nan))
-        return state.replace(replay=state.replay.replace(items=items))
-    # Adam's moments keep what a gradient was
-    part = "critic_optimiser" if kind == "gradient" else str(rng.choice(["online", "target"]))
-    leaves, structure = jax.tree.flatten(getattr(state.learner, part))
-    floats = [i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    chosen = int(rng.choice(floats))
-    flat = np.array(leaves[chosen])
-    flat.reshape(-1)[rng.integers(flat.size)] = np.nan
-    leaves[chosen] = jnp.asarray(flat)
-    poisoned = {part: jax.tree.unflatten(structure, leaves)}
-    return state.replace(learner=state.learner.replace(**poisoned))

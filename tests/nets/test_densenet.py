@@ -170,21 +170,6 @@ def test_number_of_parameters():
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
 
 
-def test_trunks_see_colour_height_and_mask():
-    """Claim: a trunk each for colour, height and mask, the latter two three times over."""
-    maps = jnp.arange(2 * 4 * 4 * 5, dtype=jnp.float32).reshape(2, 4, 4, 5)
-    zoomed = DenseNet121(upsample=4)
-    seen = np.asarray(densenet._trunk_inputs(zoomed, maps))
-    assert seen.shape == (3, 2, 8, 8, 3)
-    assert_array_equal(seen[0, :, 1::2, ::2], maps[..., :3])
-    for trunk, channel in ((1, 3), (2, 4)):
-        for copy in range(3):
-            assert_array_equal(seen[trunk, :, ::2, 1::2, copy], maps[..., channel])
-    blind = DenseNet121(colour=False)
-    only = densenet._trunk_inputs(blind, maps[..., 3:4])
-    assert_array_equal(only, jnp.repeat(maps[None, ..., 3:4], 3, axis=-1))
-
-
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a upsample a trunk says of maps what one without says of pixels repeated."""
     nets = (
@@ -214,8 +199,8 @@ def test_inputs():
 
 
 def test_trunks_have_weights_of_their_own():
-    """Claim: each trunk has its own weights, and features are joined colour first: changing what
-    one trunk sees, or one trunk's weights, changes its share of the features only."""
+    """Claim: each trunk has its own weights, and features are joined colour first, height second:
+    changing what one trunk sees, or one trunk's weights, changes its share of the features only."""
     critic = densenet.DenseNetCritic(TINY)
     maps = jnp.asarray(np.random.default_rng(2).normal(size=(1, 64, 64, 4)), jnp.float32)
     variables = random_variables(critic, 0, maps.shape)
@@ -227,6 +212,9 @@ def test_trunks_have_weights_of_their_own():
     for after in (features(heavier, maps), features(variables, maps.at[..., :3].multiply(-1.0))):
         assert_array_equal(after[..., half:], before[..., half:])
         assert np.any(after[..., :half] != before[..., :half])
+    after = features(variables, maps.at[..., 3:].multiply(-1.0))
+    assert_array_equal(after[..., :half], before[..., :half])
+    assert np.any(after[..., half:] != before[..., half:])
 
 
 @pytest.mark.parametrize(

@@ -33,32 +33,6 @@ def test_device_that_is_not_there_is_one_line(arguments: list[str], tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
 
 
-SELECT = """
-import csac_jax
-from csac_jax.errors import DeviceError
-from csac_jax.runtime import devices
-try:
-    devices.select("{}")
-except DeviceError as error:
-    print(error)
-else:
-    import jax
-    print(jax.default_backend())
-"""
-
-
-@pytest.mark.parametrize(
-    ("name", "said"), [("cpu", "cpu\n"), ("gpu", "device gpu: JAX finds none")]
-)
-def test_selected_device_goes_before_the_variable(name: str, said: str):
-    """Claim: the device that is selected is used, whatever JAX_PLATFORMS says; one that is not
-    there is an error."""
-    if name == "gpu" and devices.jax.default_backend() == "gpu":
-        pytest.skip("there is a GPU")
-    done = _python("-c", SELECT.format(name))
-    assert done.stdout.startswith(said), done.stderr
-
-
 def test_device_of_another_kind():
     """Claim: what JAX computes on is known; another kind is refused by its name."""
     devices.require()

@@ -56,17 +56,6 @@ def test_trajectory_goes_the_way_of_the_run(world, c_world: model.World, pushed:
     assert (np.diff(moved) > -1e-4).all()  # never back
 
 
-def test_trajectory_keeps_parked_blocks_where_they_are(c_world: model.World, pushed: tuple):
-    """Claim: parked blocks neither fall nor meet anything, as in the slow loop."""
-    scene, fields, joints = pushed
-    recorded = c_physics.trajectory(c_world, fields, scene, joints)
-    parked = c_world.block_qpos[1:, :3]
-    wanted = np.broadcast_to(scene_state.parking(3)[1:], (len(joints.control), 2, 3))
-    np.testing.assert_array_equal(recorded.qpos[:, parked].astype(np.float32), wanted)
-    assert not recorded.qvel[:, c_world.block_dofs[1:]].any()
-    _assert_equal(recorded, slow_loop.trajectory(c_world, fields, scene, joints))
-
-
 def test_touches_are_those_of_every_contact(c_world: model.World, pushed: tuple):
     """Claim: a hand geom touches a block in any contact deeper than 0, in either order."""
     scene, fields, joints = pushed

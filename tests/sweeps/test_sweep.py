@@ -232,6 +232,20 @@ def test_bad_folders(tmp_path: Path):
         runner.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
 
 
+@pytest.mark.parametrize(
+    "name", ["../victim", "..", ".", "", "/", "a/../../victim", "a\0b", None, 7, "groups", "link"]
+)
+def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: Any):
+    """Claim: a sweep.json whose runs would lie elsewhere, by a link too, or in the sweep's own
+    folders, is refused in one line."""
+    (tmp_path / "link").symlink_to(tmp_path.parent)
+    plan = SweepPlan(2, [SweepPoint(name, {}, CFG)])
+    (tmp_path / "sweep.json").write_text(runner.plan_text(plan))
+    with pytest.raises(SweepError, match=r"sweep\.json") as caught:
+        runner.read_plan(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
 def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
     """Claim: the replays of a group's runs together, those of points that are numbers included,
     must fit into the devices; else it is said how many would."""

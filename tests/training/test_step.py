@@ -376,6 +376,22 @@ def test_ill_scenes_leave_no_trace(run):
         assert np.issubdtype(leaf.dtype, np.integer) or np.all(np.isfinite(leaf)), name
 
 
+@pytest.mark.parametrize("part", ["reward", "critic_optimiser", "online", "target"])
+def test_nan_is_reported_at_once(run, part: str):
+    """Claim: NaN in the rewards that are learned from, in what Adam keeps of a gradient, or in a
+    network is found in the metrics of the chunk that it reaches."""
+    lose = lambda leaf: jnp.full_like(leaf, jnp.nan) if leaf.dtype == jnp.float32 else leaf  # noqa: E731
+    state = copy(run.states[1])
+    if part == "reward":
+        items = state.replay.items.replace(reward=lose(state.replay.items.reward))
+        state = state.replace(replay=state.replay.replace(items=items))
+    else:
+        lost = {part: jax.tree.map(lose, getattr(state.learner, part))}
+        state = state.replace(learner=state.learner.replace(**lost))
+    assert run.metrics[1].finite.all()
+    assert not run.chunk(state)[1].finite.all()
+
+
 @pytest.mark.parametrize("sampler", ["prioritised", "beta"])
 def test_weights_and_priorities_reach_their_places(monkeypatch, sampler):
     """Claim: the sampler's weights are those of the critic's loss, and what a batch's errors make

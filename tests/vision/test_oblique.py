@@ -1,16 +1,12 @@
 """Height maps of points and of a depth image, against NumPy and the view from above."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings, strategies as st
 
 from csac_jax import geometry
 from csac_jax.config import CameraConfig, HeightmapConfig
-from csac_jax.runtime import compiler
 from csac_jax.vision import camera, heightmap, observe, raycast
 from csac_jax.vision.heightmap import Observation
 from tests.vision.conftest import cubes
@@ -74,28 +70,6 @@ def test_the_view_agrees_with_numpy(reference):
     np.testing.assert_array_equal(obs.colour, colour)
     np.testing.assert_array_equal(obs.target, np.where(empty, False, np.asarray(tables[1])[row]))
     assert np.asarray(obs.target).any()
-
-
-def test_the_view_does_not_depend_on_rounding(reference):
-    """Claim: by kernels that compute points twice and round differently, the view is as by default,
-    but where a point crosses the border of a cell."""
-    options: Any = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-    if not all(compiler.knows(name, value) for name, value in options.items()):
-        pytest.skip("this XLA has no other kernels")
-
-    def view(polytopes: raycast.Polytopes) -> Observation:
-        tables = observe.surface_tables(polytopes, jnp.arange(6) == 4)
-        hits = camera.cast_rays(_EYE, raycast.cast_polytopes, polytopes)
-        return observe.from_pixels(CFG, _EYE, hits, tables)
-
-    polytopes = jax.tree.map(jnp.asarray, reference.polytopes)
-    one, other = (
-        jax.device_get(jax.jit(view, compiler_options=chosen)(polytopes))
-        for chosen in (None, options)
-    )
-    differ = np.abs(one.height - other.height) > 1e-5
-    differ |= (np.abs(one.colour - other.colour).max(axis=-1) > 1e-5) | (one.target != other.target)
-    assert differ.mean() < 0.005
 
 
 @jax.jit

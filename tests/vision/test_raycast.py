@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from hypothesis import given, settings, strategies as st
+from hypothesis import strategies as st
 
 from csac_jax import geometry
 from csac_jax.vision import raycast
@@ -105,25 +105,6 @@ def test_rays_along_the_axes_agree_with_mujoco(reference):
     assert clear.mean() > 0.9
     assert len(np.unique(geom[clear])) >= 6
     _assert_same(hit, clear, distance, geom)
-
-
-@settings(max_examples=60, deadline=None)
-@given(_seeds)
-def test_hits_lie_on_the_surface(seed):
-    """Claim: a hit lies on its plane, inside of all others of its geom, and faces the ray."""
-    rng = np.random.default_rng(seed)
-    polytopes = _random_scene(rng)
-    origin, direction = _random_rays(rng, 64)
-    hit = jax.tree.map(np.asarray, _cast(polytopes, origin, direction))
-    normal, offset = map(np.asarray, raycast.world_half_spaces(polytopes))
-    for r in np.flatnonzero(hit.valid & (hit.geom != _TABLE)):
-        point = origin[r] + hit.distance[r] * direction[r]
-        room = offset[hit.geom[r]] - normal[hit.geom[r]] @ point  # [F] m
-        face = np.argmin(np.abs(normal[hit.geom[r]] - hit.normal[r]).sum(-1))
-        # Rounding of a distance of about 1 m is 1e-7 m; a grazing angle magnifies it.
-        assert abs(room[face]) < 2e-6
-        assert room.min() > -1e-5
-        assert hit.normal[r] @ direction[r] < 0.0
 
 
 def test_unused_geoms_are_never_hit():

@@ -115,28 +115,3 @@ def test_bilinear_agrees_with_scipy():
     for i in range(3):
         expected = scipy.ndimage.map_coordinates(values[i], row_col[i].T, order=1, mode="nearest")
         np.testing.assert_allclose(read[i], expected, atol=1e-5)
-
-
-def test_bilinear_gradient_is_the_slope():
-    """Claim: the gradient in the place is the slope, in the values the four weights."""
-    row, col = np.meshgrid(np.arange(6.0), np.arange(7.0), indexing="ij")
-    plane = jnp.asarray(2.0 * row - 3.0 * col + 1.0, jnp.float32)
-    place = jnp.array([2.25, 4.5])
-    values, slope = jax.grad(rotate.bilinear, argnums=(0, 1))(plane, place)
-    np.testing.assert_allclose(slope, [2.0, -3.0], rtol=1e-6)
-    expected = np.zeros((6, 7))
-    expected[2:4, 4:6] = [[0.375, 0.375], [0.125, 0.125]]
-    np.testing.assert_allclose(values, expected, rtol=1e-6)
-
-
-def test_a_small_margin_loses_corners():
-    """Claim: a margin of sqrt(2) - 1 shows corners in every frame, 1/8 does not in frame 2."""
-    corners = np.zeros((64, 64, 1), np.float32)
-    corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
-    corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0
-    for margin, kept in ((2**0.5 - 1, True), (0.125, False)):
-        tables = rotate.tables(64, 0.448, _K, _K, margin)
-        frames = np.asarray(rotate.rotate(tables, jnp.asarray(corners)))
-        turned = [np.rot90(frames[2, :, :, 0], turn) for turn in range(4)]
-        quarters = np.stack(turned)[:, : tables.canvas // 4]
-        assert np.all(quarters.sum((1, 2)) >= 1.0) == kept

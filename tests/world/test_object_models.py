@@ -125,28 +125,6 @@ def test_a_swap_leaves_nothing_behind(cfg: Config, world: model.World):
     assert placed.model_bytes(again) == placed.model_bytes(fresh)
 
 
-def test_mass_and_inertia_are_the_objects(cfg: Config, world: model.World):
-    """Claim: masses and inertias in the model are those of the parts that MuJoCo itself makes."""
-    scene = dropped(cfg, 3)
-    fields = jax.device_get(model.scene_fields(world, scene))
-    exact, objects = model.with_blocks(world, fields), object_slots.library(cfg.scene).objects
-    for slot in SLOTS:
-        spec = mujoco.MjSpec()
-        body = spec.worldbody.add_body()
-        body.add_freejoint()
-        for number, part in enumerate(objects[int(scene.object_id[slot])].parts):
-            mesh = spec.add_mesh(name=f"{number}", uservert=part.vertices.ravel())
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
-            geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"{number}")
-            geom.density = float(scene.density[slot]) * HEAVY / 600.0
-        reference = spec.compile()
-        here = world.block_bodies[slot]
-        np.testing.assert_allclose(exact.body_mass[here], reference.body_mass[1], rtol=1e-5)
-        inertias = np.sort(exact.body_inertia[here]), np.sort(reference.body_inertia[1])
-        np.testing.assert_allclose(*inertias, rtol=1e-4)
-        np.testing.assert_allclose(reference.body_ipos[1], 0.0, atol=1e-6)
-
-
 def test_blocks_beside_objects_are_as_without(cfg: Config, world: model.World):
     """Claim: the fields of blocks do not depend on objects in other slots."""
     scene = dropped(cfg, 2)
