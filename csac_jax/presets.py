@@ -26,14 +26,7 @@ and another scene where none is left or the actions are spent; 2,500 actions in 
 The paper does not say after how many actions a scene is reset in training; 25 is ours. The current
 critic labels pushes (ours): early labels would stay "worse" otherwise.
 """
-SMALL_NET = {
-    "stride": 4,
-    "subpixel": 4,
-    "dilations": (1, 2, 1),
-    "stem": 32,
-    "growth": 32,
-    "head": 48,
-}
+SMALL_NET = {"subpixel": 4, "dilations": (1, 2, 1), "stem": 32, "growth": 32, "head": 48}
 STRICT_REWARD = {"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0}
 
 
@@ -144,11 +137,10 @@ def paper() -> Config:
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
     updates = {"batch": 2, "actor_batch": 1, "updates_per_step": 1, "augment": False, "tau": 0.005}
-    net = {"kind": "densenet121", "norm": "batch", "head": 64, "pad_fraction": 0.4286}
     return PROTOCOL.change(
         preset="paper",
         heightmap={"size": 224},
-        net={**net, "upsample": 2},
+        net={"kind": "densenet121", "norm": "batch", "head": 64},
         target={"gamma": 0.5},
         explore={"epsilon_place": (0.0, 0.0), "epsilon_decay": 0.9998, "push_fraction": 0.5},
         learn={**rates, **updates},
@@ -182,7 +174,7 @@ def smoke() -> Config:
         sim={"grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
-        cem={"candidates": 16, "elites": 4, "rounds": 2},
+        cem={"candidates": 16, "rounds": 2},
         learn={"batch": 8, "updates_per_step": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},

@@ -114,7 +114,7 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     _assert_same(state.target, state.online)
 
 
-_DENSENET = {"net": {"kind": "densenet121", "pad_fraction": 0.0}}
+_DENSENET = {"net": {"kind": "densenet121"}}
 _TARGET = {"task": {"kind": "target"}}
 
 
@@ -156,7 +156,7 @@ def test_weights_that_cannot_be_read_are_refused(tmp_path: Path):
     if it holds none."""
     path = tmp_path / "densenet121.safetensors"
     path.write_bytes(b"no tensors")
-    cfg = SMOKE.change(net=DenseNet121(rotations=4, pad_fraction=0.0))
+    cfg = SMOKE.change(net=DenseNet121(rotations=4))
     with pytest.raises(SettingsError, match=f"{path} cannot be read") as caught:
         api.initial_networks(cfg, path)
     assert "\n" not in str(caught.value)

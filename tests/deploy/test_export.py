@@ -131,13 +131,13 @@ def _random(cfg: Config) -> tuple[Any, Observation]:
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
-    "heights": {"net": {"colour": False, "stride": 4, "subpixel": 2, "dilations": (1, 2)}},
-    "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subpixel": 2}},
+    "heights": {"net": {"colour": False, "subpixel": 4, "dilations": (1, 2)}},
+    "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subpixel": 1}},
     "anywhere": {"policy": {"action_mask": "none", "height_bonus": 3.0}},
     "grasp": {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}},
 }
 SETTINGS["anywhere"] |= {"net": {"growth": 4, "stem": 4}}
-SETTINGS["grasp"] |= {"net": {"pad_fraction": 0.5}, "learn": {"critics": 2}}
+SETTINGS["grasp"] |= {"heightmap": {"size": 48}, "learn": {"critics": 2}}
 
 
 @pytest.mark.parametrize("name", SETTINGS)

@@ -191,12 +191,11 @@ def test_the_config_chooses_the_view():
         ({"sensor": {"kind": "d400"}}, "sensor.kind: 'd400' is not one of: none, d415"),
         ({"heightmap": {"view": "side"}}, "heightmap.view"),
         ({"heightmap": {"size": 60}}, "heightmap.size"),
-        ({"heightmap": {"size": 80}}, "net.pad_fraction"),
         ({"net": {"rotations": 202}}, "net.rotations: must be even, at most 200"),
         ({"net": {"rotations": 15}}, "net.rotations"),
     ],
 )
 def test_bad_settings_are_refused(change: dict, message: str):
-    """Claim: impossible settings of sensor, view, strides or yaws are refused by their name."""
+    """Claim: impossible settings of sensor, view or yaws are refused by their name."""
     with pytest.raises(ValueError, match=message):
         Config().change(**change)
