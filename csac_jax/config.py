@@ -182,30 +182,32 @@ class _AnyNet(Section, section="net"):
 
     dtype: ClassVar[str] = "auto"  # bfloat16 on accelerators, else float32, as are parameters
     pad_fraction: ClassVar[float]  # rotated maps are about this fraction larger than the workspace
-    stride: ClassVar[int]  # map cells per cell of the features, along each axis
+    canvas_step: ClassVar[int]  # their sides are multiples of it: whole cells of the features
     rotations: int = number(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
     colour: bool = True  # See colours, not heights alone (for an ablation).
     head: int = number(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
 
     def canvas(self, size: int) -> int:
         """Returns the cells along a side of the rotated maps of a height map of `size` cells."""
-        return round(size * (1.0 + self.pad_fraction) / self.stride) * self.stride
+        return round(size * (1.0 + self.pad_fraction) / self.canvas_step) * self.canvas_step
 
 
 class SmallNet(_AnyNet):
-    """Densely connected convolutions with group norm, at 1/4 of the map's size (ours)."""
+    """Densely connected convolutions with group norm, at 1/`stride` of the map's size (ours)."""
 
     pad_fraction: ClassVar[float] = 0.125  # cuts corners of turned maps off (ours)
-    stride: ClassVar[int] = 4  # a quarter of the work of 2 (ours)
+    canvas_step: ClassVar[int] = 4  # whole cells at either stride
     kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     gripper: bool = False  # See the gripper's opening and the size of its fingers.
     growth: int = number(24, 4)  # Channels that each dense layer adds.
     dilations: tuple[int, ...] = number((1, 2, 4, 1), 1, 64)  # Dilation of each dense layer, 3 x 3.
     stem: int = number(16, 4)  # Channels of the first convolution.
-    subpixel: Literal[1, 2, 4] = 2  # Cells of Q per cell of the features, along each axis.
+    stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
+    subpixel: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
 
     def check(self) -> None:
         require(len(self.dilations) >= 1, "net.dilations: at least one layer")
+        require(self.subpixel <= self.stride, f"net.subpixel: at most net.stride, {self.stride}")
 
 
 class DenseNet121(_AnyNet):
@@ -216,7 +218,7 @@ class DenseNet121(_AnyNet):
     gripper: ClassVar[bool] = False  # no trunk sees the gripper
     STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
     upsample: ClassVar[int] = 2  # pixels of the input per cell of the map, along each axis (VPG)
-    stride: ClassVar[int] = STRIDE // upsample
+    canvas_step: ClassVar[int] = STRIDE // upsample  # map cells per cell of the features
     pad_fraction: ClassVar[float] = 0.4286  # keeps every corner: 640 px for 448 (VPG)
     output_stride: ClassVar[int] = 4  # map cells per output cell (ours; paper: 1, 16 x the memory)
     kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
@@ -233,15 +235,14 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-    candidates: int = number(64, 2)  # J, actions sampled in a round.
+    candidates: int = number(64, 1)  # J, actions sampled in a round.
+    elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
     rounds: int = number(3, 1)  # Rounds of sampling and fitting.
     start: Literal["both", "actor", "cells"] = "both"
     """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
 
-    @property
-    def elites(self) -> int:
-        """Returns K, the best tenth of a round, to which the next one is fitted (QT-Opt)."""
-        return max(2, round(0.1 * self.candidates))
+    def check(self) -> None:
+        require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
 
 
 class PolicyConfig(Section, section="policy"):

@@ -26,7 +26,14 @@ and another scene where none is left or the actions are spent; 2,500 actions in 
 The paper does not say after how many actions a scene is reset in training; 25 is ours. The current
 critic labels pushes (ours): early labels would stay "worse" otherwise.
 """
-SMALL_NET = {"subpixel": 4, "dilations": (1, 2, 1), "stem": 32, "growth": 32, "head": 48}
+SMALL_NET = {
+    "stride": 4,
+    "subpixel": 4,
+    "dilations": (1, 2, 1),
+    "stem": 32,
+    "growth": 32,
+    "head": 48,
+}
 STRICT_REWARD = {"grasp_levels": (-1.5, -1.5, -1.5, -1.0, 1.0), "lost_block_penalty": 3.0}
 
 
@@ -174,7 +181,7 @@ def smoke() -> Config:
         sim={"grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
-        cem={"candidates": 16, "rounds": 2},
+        cem={"candidates": 16, "elites": 4, "rounds": 2},
         learn={"batch": 8, "updates_per_step": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},

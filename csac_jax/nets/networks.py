@@ -78,8 +78,7 @@ class Networks:
 def make(cfg: NetConfig, critic: Any = None) -> Networks:
     """Builds the networks of a config, or of the Flax module `critic` with a head of `cfg.head`."""
     if critic is not None:
-        head = dense.Head(SmallNet(head=cfg.head, subpixel=1))
-        return Networks(critic, head, critic.stride, cfg.colour)
+        return Networks(critic, dense.Head(SmallNet(head=cfg.head)), critic.stride, cfg.colour)
     if isinstance(cfg, SmallNet):
         stride = cfg.stride // cfg.subpixel
         return Networks(dense.Critic(cfg), dense.Head(cfg), stride, cfg.colour)

@@ -32,7 +32,7 @@ class FineDenseNet(DenseNet121):
 
     output_stride: ClassVar[int] = 1
     upsample: ClassVar[int] = 1
-    stride: ClassVar[int] = DenseNet121.STRIDE
+    canvas_step: ClassVar[int] = DenseNet121.STRIDE
 
 
 def _densenet(pixels: int) -> Config:

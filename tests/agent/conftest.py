@@ -14,15 +14,13 @@ from csac_jax.agent.maps import Frames
 from csac_jax.config import Config, SmallNet
 from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
-from tests.sections import with_constants
 
 
 @pytest.fixture(scope="session")
 def cfg() -> Config:
     """The smallest preset with eight yaws, and a run so long that no schedule moves on."""
-    net = SmallNet(rotations=8, growth=4, dilations=(1, 2), stem=4, head=8, subpixel=1)
-    fine = with_constants(net, stride=2)
-    return presets.smoke().change(net=fine, train={"actions": 1_000_000})
+    net = SmallNet(rotations=8, growth=4, dilations=(1, 2), stem=4, head=8)
+    return presets.smoke().change(net=net, train={"actions": 1_000_000})
 
 
 @pytest.fixture(scope="session")

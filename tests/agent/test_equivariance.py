@@ -22,9 +22,7 @@ QUARTER = K // 4
 SIZE = 96
 NETS = {
     "small": with_constants(
-        SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, subpixel=1),
-        pad_fraction=0.5,
-        stride=2,
+        SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8), pad_fraction=0.5
     ),
     "densenet121": with_constants(
         DenseNet121(rotations=K, head=8),

@@ -42,7 +42,9 @@ SMALL = {"kind": "small"}
         (224, {"kind": "offset"}, "net.kind: 'offset' is not one of: small, densenet121"),
         (224, {"stem": 16}, "net.stem: unknown setting"),
         (64, {**SMALL, "norm": "batch"}, "net.norm: unknown setting"),
+        (64, {**SMALL, "stride": 3}, "net.stride: 3 is not one of: 2, 4"),
         (64, {**SMALL, "subpixel": 3}, "net.subpixel: 3 is not one of: 1, 2, 4"),
+        (64, {**SMALL, "subpixel": 4}, "net.subpixel: at most net.stride, 2"),
         (64, {**SMALL, "dilations": ()}, "net.dilations: at least one layer"),
         (64, {"rotations": 5}, "net.rotations: must be even"),
     ],
@@ -57,14 +59,14 @@ def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: st
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_strides_divide_rotated_maps(kind: str):
     """Claim: rotated maps of any height map are about 1/8, or sqrt(2) - 1, larger, by whole cells
-    of the features. The paper's are 320 cells, for 224."""
+    of the features at any stride. The paper's are 320 cells, for 224."""
     assert (DenseNet121().canvas(224), SmallNet().canvas(64)) == (320, 72)
     for size in range(16, 225, 8):
-        net = _config(size, kind=kind).net
-        frames = maps.frames(_config(size, kind=kind), networks.make(net))
-        assert frames.tables.canvas % net.stride == 0
-        exact = size * (1.125 if kind == "small" else 2.0**0.5)
-        assert abs(frames.tables.canvas - exact) <= 0.5 * net.stride + 0.02 * size
+        cfg = _config(size, kind=kind)
+        frames = maps.frames(cfg, networks.make(cfg.net))
+        assert frames.tables.canvas % cfg.net.canvas_step == 0
+        exact = size * (1.125 if cfg.net.kind == "small" else 2.0**0.5)
+        assert abs(frames.tables.canvas - exact) <= 0.5 * cfg.net.canvas_step + 0.02 * size
 
 
 @pytest.mark.parametrize("colour", [True, False])
