@@ -1,16 +1,16 @@
 """Every setting of a run, as frozen and hashable dataclasses.
 
 Metres, radians and seconds unless a name says otherwise. Numbers marked (ours) are measured, the
-others name their source. A `ClassVar` is a constant, no setting.
+others name their source. A `ClassVar` is a constant, no setting. A setting that no preset and no
+algorithm turns ends with whom it is for: (for own cameras), (for the study).
 """
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
-from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
-from csac_jax.section import Section, names, number, require, shown
+from csac_jax.section import ALTERNATIVES, Section, changed, number, require
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder", "object"]
 RobotKind = Literal["hand", "ur5", "ur5e"]
@@ -29,7 +29,7 @@ class SceneConfig(Section, section="scene"):
     objects: str = ""
     """Library for slots of kind object: a folder, or procedural[+assemblies]:SEED:COUNT."""
     split: Literal["train", "held_out", "all"] = "train"
-    """Objects of the library to draw: those for training, those kept for evaluation, or all."""
+    """Objects of the library: those for training, those kept for evaluation, or all (for eval)."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
@@ -81,13 +81,13 @@ class SimConfig(Section, section="sim"):
     """`mjx`: compiled with everything else. `warp`: MJX on NVIDIA's Warp, faster on CUDA, not
     repeatable bit for bit. `c`: C MuJoCo on the host's cores, the reference. `auto`: `c` on a CPU,
     `warp` on one CUDA device where it is known to be faster, else `mjx`, or `c` for objects."""
-    robot: RobotKind = "hand"  # The gripper alone, floating, for training; or on that arm.
+    robot: RobotKind = "hand"  # The gripper alone, floating; or on that arm (for own arms).
     gripper: str | Gripper = "rg2"
     """`rg2`, `2f85`, `franka_hand`, or a folder with your own gripper.json and gripper.xml.
     `varied` has another opening and other fingers in every episode."""
     base: tuple[float, float, float, float] = number((0.6, 0.0, 0.35, 0.0), -math.pi, math.pi)
-    """Pose of the arm's base: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
-    adapter: float = number(0.0, 0.0, 0.3)  # Length between the arm's flange and the gripper, m.
+    """Pose of the arm's base: x, y, z, m, and yaw, rad (ours: scenes/README.md; for own arms)."""
+    adapter: float = number(0.0, 0.0, 0.3)  # Arm's flange to gripper, m (for own arms).
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
     geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
@@ -106,7 +106,7 @@ class SimConfig(Section, section="sim"):
 
 
 class CameraConfig(Section, section="camera"):
-    """A pinhole camera; pixel centres are whole numbers. The default is VPG's."""
+    """A pinhole camera, VPG's (for own cameras); pixel centres are whole numbers."""
 
     size: tuple[int, int] = number((640, 480), 8, 4096)  # Width and height of the image, px.
     focal: Pair = (618.62, 618.62)  # Focal lengths along width and height, px.
@@ -142,6 +142,7 @@ class SensorConfig(Section, section="sensor"):
 
     Depth errors: sigma = floor + square d^2; a structured-light camera has a square of 0.0014
     (Khoshelham and Elberink, Sensors 12, 2012). All but errors of pixels are drawn once a view.
+    (for own cameras, the study and the policy `camera`)
     """
 
     kind: SensorKind = "none"  # Camera to imitate, oblique view; see vision/depth_camera.py.
@@ -163,9 +164,9 @@ class HeightmapConfig(Section, section="heightmap"):
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
     size: int = number(64, 16)  # H = W, cells.
-    extent: float = number(0.448, 0.1, 1.0)  # Side of the square workspace, m (VPG).
+    extent: float = number(0.448, 0.1, 1.0)  # Side of the workspace, m (VPG; for own tables).
     view: Literal["ortho", "oblique"] = "ortho"
-    """`ortho`: cast from above, complete. `oblique`: points of `camera`'s depth image (VPG)."""
+    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras)."""
 
     @property
     def cell(self) -> float:
@@ -180,16 +181,22 @@ class _AnyNet(Section, section="net"):
     """Settings of every network."""
 
     dtype: ClassVar[str] = "auto"  # bfloat16 on accelerators, else float32, as are parameters
+    pad_fraction: ClassVar[float]  # rotated maps are about this fraction larger than the workspace
+    canvas_step: ClassVar[int]  # their sides are multiples of it: whole cells of the features
     rotations: int = number(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
-    colour: bool = True  # See colours, not heights alone.
-    pad_fraction: float = number(0.125, 0.0, 0.5)
-    """Rotated maps are this fraction larger than the workspace; sqrt(2) - 1 keeps every corner."""
+    colour: bool = True  # See colours, not heights alone (for an ablation).
     head: int = number(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
+
+    def canvas(self, size: int) -> int:
+        """Returns the cells along a side of the rotated maps of a height map of `size` cells."""
+        return round(size * (1.0 + self.pad_fraction) / self.canvas_step) * self.canvas_step
 
 
 class SmallNet(_AnyNet):
     """Densely connected convolutions with group norm, at 1/`stride` of the map's size (ours)."""
 
+    pad_fraction: ClassVar[float] = 0.125  # cuts corners of turned maps off (ours)
+    canvas_step: ClassVar[int] = 4  # whole cells at either stride
     kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     gripper: bool = False  # See the gripper's opening and the size of its fingers.
     growth: int = number(24, 4)  # Channels that each dense layer adds.
@@ -202,47 +209,25 @@ class SmallNet(_AnyNet):
         require(len(self.dilations) >= 1, "net.dilations: at least one layer")
         require(self.subpixel <= self.stride, f"net.subpixel: at most net.stride, {self.stride}")
 
-    def check_canvas(self, size: int) -> None:
-        """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
-        side = canvas_size(size, self.pad_fraction)
-        fault = f"net.pad_fraction: rotated maps of {side} cells are not a multiple of 4"
-        require(side % 4 == 0, fault)
-
 
 class DenseNet121(_AnyNet):
-    """The paper's (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/32."""
+    """The paper's (CSAC sec. 3.4): a trunk each for colour, height and target mask, at 1/16."""
 
     block_layers: ClassVar[tuple[int, int, int, int]] = (6, 12, 24, 16)  # arXiv:1608.06993, table 1
     block_growth: ClassVar[int] = 32  # channels that each dense layer adds (the same)
     gripper: ClassVar[bool] = False  # no trunk sees the gripper
     STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
+    upsample: ClassVar[int] = 2  # pixels of the input per cell of the map, along each axis (VPG)
+    canvas_step: ClassVar[int] = STRIDE // upsample  # map cells per cell of the features
+    pad_fraction: ClassVar[float] = 0.4286  # keeps every corner: 640 px for 448 (VPG)
     output_stride: ClassVar[int] = 4  # map cells per output cell (ours; paper: 1, 16 x the memory)
     kind: Literal["densenet121"] = "densenet121"  # The paper's network; `small` is ours.
     norm: Literal["group", "batch"] = "group"
     """`batch`, as in the paper, or `group`, which is the same while acting and while learning."""
-    upsample: int = number(1, 1)  # Pixels of the input per cell of the map, each axis (VPG 2).
-
-    def check(self) -> None:
-        largest = self.STRIDE // self.output_stride
-        require(largest % self.upsample == 0, f"net.upsample: must divide {largest}")
-
-    def check_canvas(self, size: int) -> None:
-        """Raises SettingsError if the strides do not divide the rotated maps of `size` cells."""
-        side, step = canvas_size(size, self.pad_fraction), self.STRIDE // self.upsample
-        first = -(-size // step) * step
-        sides = [s for s in range(first, first + 3 * step, step) if s <= 1.5 * size]
-        fitting = ", ".join(f"{s / size - 1:.4f} ({s} cells)" for s in sides)
-        remedy = f"try {fitting}" if fitting else f"take another heightmap.size than {size}"
-        needs = f"DenseNet-121 needs maps of a multiple of {step} cells, not {side}"
-        require(side % step == 0, f"net.pad_fraction: {needs}; {remedy}")
 
 
 NetConfig = SmallNet | DenseNet121
-
-
-def canvas_size(size: int, pad_fraction: float) -> int:
-    """Returns the cells along a side of the rotated maps of a height map of `size` cells."""
-    return round(size * (1 + pad_fraction) / 2) * 2
+ALTERNATIVES["net"] = ("kind", get_args(NetConfig))
 
 
 class CEMConfig(Section, section="cem"):
@@ -254,7 +239,7 @@ class CEMConfig(Section, section="cem"):
     elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
     rounds: int = number(3, 1)  # Rounds of sampling and fitting.
     start: Literal["both", "actor", "cells"] = "both"
-    """First round: the actor's mean and the best cells; its mean alone; the best cell alone."""
+    """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
 
     def check(self) -> None:
         require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
@@ -267,11 +252,11 @@ class PolicyConfig(Section, section="policy"):
     primitive: Literal["argmax", "rule", "grasp"] = "argmax"
     """That of larger value; a push after no visible change, else a grasp (sec. 3.4); a grasp."""
     action_mask: Literal["occupied", "none"] = "occupied"
-    """Cells where actions may begin: those with something to act on (SPOT); or all (CSAC)."""
+    """Cells where actions may begin: those with something (SPOT); all (CSAC; for the study)."""
     retry_temperature: float = number(0.0, 0.0, 10.0)
-    """Temperature, in units of Q, that each failed grasp in a row adds to the draw of a place."""
+    """Temperature, in Q, that each failed grasp in a row adds to the draw of a place (for eval)."""
     height_bonus: float = number(0.0, 0.0, 100.0)
-    """Q that each metre of the surface under a cell adds to the choice: what lies on top first."""
+    """Q that each metre of the surface under a cell adds: what lies on top first (for eval)."""
     augment: bool = False
     """Q is the mean over mirror images and critics, at four times the work, unless exploring."""
 
@@ -311,7 +296,7 @@ class RewardConfig(Section, section="reward"):
     push_levels: Pair = (-1.0, 1.0)  # I_c of eq. 16: any other push, a good push.
     lost_block_penalty: float = number(0.0, 0.0)  # For a block that leaves the workspace (ours).
     outcome_source: Literal["simulator", "sensors"] = "simulator"
-    """Judge of grasps: the simulator's contacts and poses; or finger gap and maps (sec. 3.3)."""
+    """Judge of grasps: the simulator; or finger gap and maps (sec. 3.3; for the study)."""
 
     @property
     def relabels(self) -> bool:
@@ -388,9 +373,9 @@ class BetaReplay(_AnyReplay):
 
     middle_at: ClassVar[float] = 0.4  # share of all updates after which (a, b) is `middle` (ours)
     sampler: Literal["beta"] = "beta"  # Others: uniform, prioritised, opposite.
-    rank_by: Literal["error", "reward"] = "error"  # Rank 0: largest abs(TD error), or reward.
-    start: Pair = number((0.5, 0.5), 0.0, above=True)  # (a, b) at first (CSAC sec. 4.3).
-    middle: Pair = number((1.0, 1.0), 0.0, above=True)  # (a, b) on the way (sec. 3.5: uniform).
+    rank_by: Literal["error", "reward"] = "error"  # What is largest at rank 0 (for the study).
+    start: Pair = number((0.5, 0.5), 0.0, above=True)  # (a, b) at first (sec. 4.3; for the study).
+    middle: Pair = number((1.0, 1.0), 0.0, above=True)  # On the way (sec. 3.5; for the study).
     end: Pair = number((1.0, 12.0), 0.0, above=True)  # (a, b) in the end (CSAC sec. 4.3).
 
 
@@ -402,6 +387,7 @@ class OppositeReplay(_AnyReplay):
 
 
 ReplayConfig = UniformReplay | PrioritisedReplay | BetaReplay | OppositeReplay
+ALTERNATIVES["replay"] = ("sampler", get_args(ReplayConfig))
 
 
 class TrainConfig(Section, section="train"):
@@ -419,19 +405,12 @@ class TrainConfig(Section, section="train"):
         return math.ceil(self.actions / self.scenes)
 
 
-ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {
-    "net": ("kind", (SmallNet, DenseNet121)),
-    "replay": ("sampler", (UniformReplay, PrioritisedReplay, BetaReplay, OppositeReplay)),
-}
-"""Sections that are unions: the field that names the alternative, and the alternatives."""
-
-
 class Config(Section):
     """A run: everything that decides its result."""
 
     preset: str = "quick"  # Name of the preset that this config was made from.
     algo: str = "csac_beta"  # Algorithm that was asked for; the sections say what it is made of.
-    seed: int = number(0, 0, 2**31 - 1)  # Number that all randomness of the run follows from.
+    seed: int = number(0, 0, 2**31 - 1)  # Number that all randomness follows from (for every run).
     scene: SceneConfig = SceneConfig()
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()
@@ -454,8 +433,7 @@ class Config(Section):
         A dict with another `kind` or `sampler` takes that alternative, which keeps what both have.
         Raises SettingsError for an unknown name or a bad value.
         """
-        values = {name: _changed(getattr(self, name, None), new) for name, new in sections.items()}
-        return _replaced(self, values)
+        return changed(self, sections)
 
     def check(self) -> None:
         may_push = self.policy.primitive != "grasp" or self.explore.push_fraction == 0.0
@@ -469,44 +447,14 @@ class Config(Section):
         require(holds, "replay.capacity: must hold train.scenes and learn.batch transitions")
         for name, off in (("pose_noise", 0), ("intrinsics_noise", 0), ("kind", "none")):
             is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
-            fits = is_off or self.heightmap.view == "oblique"
-            require(fits, f"sensor.{name}: must be {off} where heightmap.view is ortho")
+            fault = f"sensor.{name}: must be {off} where heightmap.view is ortho"
+            require(is_off or self.heightmap.view == "oblique", fault)
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         fits = rotations % 2 == 0 and rotations <= most
         require(fits, f"net.rotations: must be even, at most {most} for heightmap.size {size}")
-        self.net.check_canvas(size)
         fits = not self.scene.has_objects or self.sim.physics != "mjx"
         require(fits, "sim.physics: objects that differ between scenes need c, warp or auto")
         scaled = self.scene.size_jitter[1] != 0.0 and set(MESH_KINDS) & set(self.scene.slots)
         fits = self.sim.physics != "warp" or not scaled
         require(fits, "scene.size_jitter: the second must be 0 where sim.physics is warp")
-
-
-def _changed(section: Any, value: Any) -> Any:
-    if not isinstance(value, dict) or not isinstance(section, Section):
-        return value
-    tag, _ = ALTERNATIVES.get(section.SECTION, ("", ()))
-    return _replaced(alternative(section, value[tag]) if tag in value else section, value)
-
-
-def _replaced(section: Any, values: dict[str, Any]) -> Any:
-    for name in values.keys() - names(section):
-        raise SettingsError(f"{section.SECTION}.{name}: unknown setting".lstrip("."))
-    return dataclasses.replace(section, **values)
-
-
-def alternative(section: Any, choice: str) -> Any:
-    """Returns the alternative of that name, with what it shares with `section`."""
-    kind = alternative_kind(section.SECTION, choice)
-    shared = names(kind) & names(section) - {ALTERNATIVES[section.SECTION][0]}
-    return kind(**{name: getattr(section, name) for name in shared})
-
-
-def alternative_kind(section: str, choice: Any) -> Any:
-    """Returns the class of the alternative of that name. Raises SettingsError for an unknown."""
-    tag, kinds = ALTERNATIVES[section]
-    choices = [getattr(kind, tag) for kind in kinds]
-    fault = f"{section}.{tag}: {shown(choice)} is not one of: {', '.join(choices)}"
-    require(choice in choices, fault)
-    return kinds[choices.index(choice)]

@@ -144,11 +144,10 @@ def paper() -> Config:
     """
     rates = {"learning_rate": 1e-4, "actor_learning_rate": 1e-4, "lr_final_fraction": 1.0}
     updates = {"batch": 2, "actor_batch": 1, "updates_per_step": 1, "augment": False, "tau": 0.005}
-    net = {"kind": "densenet121", "norm": "batch", "head": 64, "pad_fraction": 0.4286}
     return PROTOCOL.change(
         preset="paper",
         heightmap={"size": 224},
-        net={**net, "upsample": 2},
+        net={"kind": "densenet121", "norm": "batch", "head": 64},
         target={"gamma": 0.5},
         explore={"epsilon_place": (0.0, 0.0), "epsilon_decay": 0.9998, "push_fraction": 0.5},
         learn={**rates, **updates},

@@ -81,3 +81,37 @@ def shown(value: Any) -> str:
 def names(section: Any) -> set[str]:
     """Returns the names of the settings of a section or of its class."""
     return {field.name for field in dataclasses.fields(section)}
+
+
+ALTERNATIVES: dict[str, tuple[str, tuple[type[Section], ...]]] = {}
+"""Sections that are unions: the field that names the alternative, and the alternatives."""
+
+
+def alternative_kind(section: str, choice: Any) -> Any:
+    """Returns the class of the alternative of that name. Raises SettingsError for an unknown."""
+    tag, kinds = ALTERNATIVES[section]
+    choices = [getattr(kind, tag) for kind in kinds]
+    fault = f"{section}.{tag}: {shown(choice)} is not one of: {', '.join(choices)}"
+    require(choice in choices, fault)
+    return kinds[choices.index(choice)]
+
+
+def alternative(section: Any, choice: str) -> Any:
+    """Returns the alternative of that name, with what it shares with `section`."""
+    kind = alternative_kind(section.SECTION, choice)
+    shared = names(kind) & names(section) - {ALTERNATIVES[section.SECTION][0]}
+    return kind(**{name: getattr(section, name) for name in shared})
+
+
+def changed(section: Any, values: dict[str, Any]) -> Any:
+    """Returns a section with other values; a dict changes a section in it, or its alternative."""
+    tag, _ = ALTERNATIVES.get(section.SECTION, ("", ()))
+    section = alternative(section, values[tag]) if tag in values else section
+    for name in values.keys() - names(section):
+        raise SettingsError(f"{section.SECTION}.{name}: unknown setting".lstrip("."))
+    inner = {
+        name: changed(part, new)
+        for name, new in values.items()
+        if isinstance(part := getattr(section, name), Section) and isinstance(new, dict)
+    }
+    return dataclasses.replace(section, **values | inner)

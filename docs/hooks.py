@@ -24,10 +24,10 @@ from mkdocs.structure.files import File  # noqa: E402
 from tyro import _docstrings  # noqa: E402
 
 import csac_jax  # noqa: E402
-from csac_jax import cli, config  # noqa: E402
+from csac_jax import cli  # noqa: E402
 from csac_jax.config import Config  # noqa: E402
 from csac_jax.evaluation import metrics, suites  # noqa: E402
-from csac_jax.section import Section  # noqa: E402
+from csac_jax.section import ALTERNATIVES, Section  # noqa: E402
 from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
@@ -139,7 +139,7 @@ def settings_tables() -> str:
     for field in dataclasses.fields(Config):
         if not isinstance(field.default, Section):
             continue
-        tag, kinds = config.ALTERNATIVES.get(field.name, ("", (type(field.default),)))
+        tag, kinds = ALTERNATIVES.get(field.name, ("", (type(field.default),)))
         for kind in kinds:
             title = f"{field.name}, {getattr(kind, tag)}" if tag else field.name
             parts.append(f"## {title}\n\n{_text(kind.__doc__)}\n\n{_settings_of(field.name, kind)}")

@@ -114,7 +114,7 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     _assert_same(state.target, state.online)
 
 
-_DENSENET = {"net": {"kind": "densenet121", "pad_fraction": 0.0}}
+_DENSENET = {"net": {"kind": "densenet121"}}
 _TARGET = {"task": {"kind": "target"}}
 
 

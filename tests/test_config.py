@@ -6,9 +6,11 @@ import re
 
 import jax
 import pytest
+from tyro import _docstrings
 
-from csac_jax import config, presets
+from csac_jax import algorithms, presets, section
 from csac_jax.config import Config, PrioritisedReplay
+from csac_jax.io import configs
 
 
 def _config(settings: dict) -> Config:
@@ -56,7 +58,6 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("heightmap.extent", [0.05, 1.1]),
         ("net.rotations", [2, 5]),
         ("net.dilations", [(), (1, 0)]),
-        ("net.pad_fraction", [-0.125, 0.625]),
         ("net.stride", [3]),
         ("net.subpixel", [3]),
         ("policy.retry_temperature", [-0.1, 11.0]),
@@ -99,7 +100,6 @@ def test_values_out_of_range(name: str, values: list):
         ({"camera.size": (8192, 480)}, "camera.size: must be at most 4096"),
         ({"sensor.pose_noise": (0.01, 0.0)}, "sensor.pose_noise: must be 0"),
         ({"net.subpixel": 4, "net.stride": 2}, "net.subpixel: at most net.stride"),
-        ({"net.kind": "densenet121", "net.upsample": 3}, "net.upsample: must divide 8"),
         ({"learn.actor_batch": 33}, "learn.actor_batch: must not exceed learn.batch"),
         ({"policy.primitive": "grasp"}, "explore.push_fraction: must be 0"),
         (
@@ -107,7 +107,7 @@ def test_values_out_of_range(name: str, values: list):
             "reward.push_label: current_critic needs target.bootstrap episodic",
         ),
         ({"learn.bath": 3}, "learn.bath: unknown setting"),
-        ({"net.upsample": 2}, "net.upsample: unknown setting"),
+        ({"net.norm": "batch"}, "net.norm: unknown setting"),
         ({"bath": 3}, "bath: unknown setting"),
     ],
 )
@@ -125,7 +125,7 @@ def test_settings_that_do_not_go_together(settings: dict, message: str):
         {"sim.physics": "warp", "scene.slots": ("box",) * 5, "scene.size_jitter": (0.1, 0.1)},
         {"sensor.pose_noise": (0.01, 0.0), "heightmap.view": "oblique"},
         {"policy.primitive": "grasp", "explore.push_fraction": 0.0},
-        {"net.kind": "densenet121", "net.norm": "batch", "net.pad_fraction": 0.0},
+        {"net.kind": "densenet121", "net.norm": "batch"},
     ],
 )
 def test_settings_that_go_together(settings: dict):
@@ -137,9 +137,7 @@ def test_an_alternative_keeps_what_both_have():
     """Claim: another sampler keeps the capacity, another network the rotations; the same one keeps
     everything."""
     cfg = presets.quick().change(replay={"capacity": 99}, net={"rotations": 8})
-    other = cfg.change(
-        replay={"sampler": "prioritised"}, net={"kind": "densenet121", "pad_fraction": 0.0}
-    )
+    other = cfg.change(replay={"sampler": "prioritised"}, net={"kind": "densenet121"})
     assert other.replay == PrioritisedReplay(capacity=99)
     assert (other.net.kind, other.net.rotations) == ("densenet121", 8)
     assert cfg.change(replay={"sampler": "beta"}) == cfg
@@ -157,13 +155,35 @@ def test_traced_settings_are_not_checked():
         inside(3.0)
 
 
-def test_at_most_100_settings():
-    """Claim: there are at most 100 settings, those of all alternatives counted."""
-    names = {field.name for field in dataclasses.fields(Config)}
-    for field in dataclasses.fields(Config):
-        default = getattr(Config(), field.name)
-        if isinstance(default, config.Section):
-            _, kinds = config.ALTERNATIVES.get(field.name, ("", (type(default),)))
-            names.remove(field.name)
-            names |= {f"{field.name}.{f.name}" for kind in kinds for f in dataclasses.fields(kind)}
-    assert len(names) <= 100
+def _fields() -> dict[str, tuple[type, dataclasses.Field]]:
+    """The class and the field of every setting, those of all alternatives, by dotted names."""
+    named = {}
+    for name, default in vars(Config()).items():
+        if isinstance(default, section.Section):
+            _, kinds = section.ALTERNATIVES.get(name, ("", (type(default),)))
+            for kind in kinds:
+                named |= {
+                    f"{name}.{field.name}": (kind, field) for field in dataclasses.fields(kind)
+                }
+        else:
+            named[name] = Config, Config.__dataclass_fields__[name]
+    return named
+
+
+def test_at_most_98_settings():
+    """Claim: there are at most 98 settings, those of all alternatives counted."""
+    assert len(_fields()) <= 98
+
+
+def test_settings_that_no_preset_turns_say_whom_they_are_for():
+    """Claim: the text of a setting that no preset and no algorithm turns, or of its section, ends
+    with whom it is for; there are at most 28."""
+    turned = {"preset", "algo"}
+    for preset in map(presets.get, presets.PRESETS):
+        for algo in algorithms.ALGORITHMS:
+            turned |= set(configs.differences(Config(), algorithms.configure(preset, algo)))
+    kept = {name: of for name, of in _fields().items() if name not in turned}
+    assert 20 <= len(kept) <= 28
+    for name, (kind, field) in kept.items():
+        text = _docstrings.get_field_docstring(kind, field.name, ()) or ""
+        assert re.search(r"\bfor [\w` ,]+\)", f"{text} {kind.__doc__}"), name

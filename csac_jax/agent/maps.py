@@ -52,7 +52,7 @@ class Frames:
 def frames(cfg: Config, networks: Networks) -> Frames:
     """Builds the frames of a config's heightmap and net."""
     size, extent, rotations = cfg.heightmap.size, cfg.heightmap.extent, cfg.net.rotations
-    tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.pad_fraction)
+    tables = rotate.tables(size, extent, rotations, rotations // 2, cfg.net.canvas(size))
     side, cell = tables.canvas // networks.stride, tables.cell * networks.stride
     sim = dataclasses.replace(cfg.sim, gripper=grippers.resolve(cfg.sim.gripper))
     xy, yaws = _cells(rotations, side, cell)

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from csac_jax import algorithms, config, presets
+from csac_jax import algorithms, presets
 from csac_jax.cli import parsing
 from csac_jax.cli.failures import exists
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.section import Section
+from csac_jax.section import ALTERNATIVES, Section, alternative, names
 
 PRESETS = ", ".join(presets.PRESETS)
 FIRST = {
@@ -102,9 +102,9 @@ def _sections(base: Config, flags: Sequence[str]) -> dict[str, Any]:
     sections: dict[str, Any] = {
         name: one for name, one in vars(base).items() if isinstance(one, Section)
     }
-    for name, (tag, kinds) in config.ALTERNATIVES.items():
+    for name, (tag, kinds) in ALTERNATIVES.items():
         choice = parsing.take(flags, f"--{name}.{tag}")[0] or getattr(sections[name], tag)
-        sections[name] = config.alternative(sections[name], choice)
+        sections[name] = alternative(sections[name], choice)
         others = set().union(*(vars(kind()) for kind in kinds)) - vars(sections[name]).keys()
         for flag in flags:
             prefix, _, setting = flag.split("=")[0].replace("-", "_").rpartition(".")
@@ -150,7 +150,7 @@ def parse_view(
     kinds = {}
     for name, some in VIEW.items():
         kind = type(getattr(Config, name))
-        kinds[name] = _some(kind, some or config.names(kind), "(default: the policy's)")
+        kinds[name] = _some(kind, some or names(kind), "(default: the policy's)")
     given = parsing.parse(_with_sections(options, kinds), flags, command)
     named = {flag.split("=")[0].replace("-", "_") for flag in flags}
     return given, {

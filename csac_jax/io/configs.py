@@ -18,12 +18,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from csac_jax import algorithms, config, grippers, presets
+from csac_jax import algorithms, grippers, presets
 from csac_jax.config import Config, SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
 from csac_jax.io import files, renames
-from csac_jax.section import Section, names, shown
+from csac_jax.section import (
+    ALTERNATIVES,
+    Section,
+    alternative,
+    alternative_kind,
+    names,
+    require,
+    shown,
+)
 
 FORMAT = 2
 
@@ -69,13 +77,23 @@ def _validated(name: str, stored: Any) -> Any:
     if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
         sim = _validated(name, stored | {"gripper": SimConfig.gripper})
         return dataclasses.replace(sim, gripper=_own_gripper(stored["gripper"]))
-    adapter = _adapter(_kind(name, stored))
+    kind, items = _kind(name, stored), stored.items() if isinstance(stored, dict) else ()
+    fixed = {k: v for k, v in items if k in renames.FIXED.get(name, ()) and hasattr(kind, k)}
+    rest = {k: v for k, v in items if k not in fixed} if fixed else stored
+    part = _parsed(kind, name, rest)
+    for field, value in fixed.items():
+        today = getattr(part, field)
+        require(value == today, f"{name}.{field}: must be {today}, not {shown(value)}")
+    return part
+
+
+def _parsed(kind: Any, name: str, stored: Any) -> Any:
     try:
         text = json.dumps(stored)
     except RecursionError:
         raise SettingsError(f"{name}: is nested too deeply") from None
     try:
-        return adapter.validate_json(text, strict=True)
+        return _adapter(kind).validate_json(text, strict=True)
     except ValueError as error:
         first = error.errors(include_url=False)[0]
     if first["type"] == "value_error":
@@ -89,9 +107,9 @@ def _validated(name: str, stored: Any) -> Any:
 def _kind(name: str, stored: Any) -> Any:
     if name not in names(Config):
         raise SettingsError(f"{name}: unknown setting")
-    tag, _ = config.ALTERNATIVES.get(name, ("", ()))
+    tag, _ = ALTERNATIVES.get(name, ("", ()))
     if tag and isinstance(stored, dict) and tag in stored:
-        return config.alternative_kind(name, stored[tag])
+        return alternative_kind(name, stored[tag])
     return type(getattr(Config, name))
 
 
@@ -147,9 +165,9 @@ def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
             continue
         if not isinstance(value, dict):
             raise SettingsError(f"{name}: must be a section of settings, not {shown(value)}")
-        tag, _ = config.ALTERNATIVES.get(name, ("", ()))
+        tag, _ = ALTERNATIVES.get(name, ("", ()))
         if tag in value:
-            whole[name] = vars(config.alternative(section, value[tag]))
+            whole[name] = vars(alternative(section, value[tag]))
         whole[name] = whole[name] | value
     return whole
 

@@ -25,6 +25,9 @@ SETTINGS: dict[str, str | None] = {
 }
 """Settings by their dotted names; None: the setting is gone, whatever its value."""
 
+FIXED = {"net": {"pad_fraction", "upsample"}}
+"""Former settings of each section, which must have the value of today's constant."""
+
 VALUES: dict[str, dict[str, str]] = {
     "policy.action_mask": {"all": "none"},
     "reward.outcome_source": {"truth": "simulator", "sensed": "sensors"},

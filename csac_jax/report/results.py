@@ -17,12 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from csac_jax.config import shown
 from csac_jax.errors import SettingsError
 from csac_jax.io import files, renames
 from csac_jax.report import variants
 from csac_jax.report.variants import Json, Variant
-from csac_jax.section import require
+from csac_jax.section import require, shown
 
 ARCHIVE = ".tar.xz"  # of folders of runs
 RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it

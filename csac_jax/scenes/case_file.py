@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal, Self
 import pydantic
 from pydantic import BaseModel, Field
 
-from csac_jax.config import shown
 from csac_jax.errors import first_fault
+from csac_jax.section import shown
 from csac_jax.world import blocks
 
 _BLOCK = re.compile(r"'blocks\.(\d+)(' |\.)")  # in a fault: a block, or a key of it

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from csac_jax.algorithms import unknown
-from csac_jax.config import ALTERNATIVES, Config, Section
+from csac_jax.config import Config
 from csac_jax.errors import SettingsError
 from csac_jax.io import renames
-from csac_jax.section import require
+from csac_jax.section import ALTERNATIVES, Section, require
 
 LONGEST = 120  # characters of a point's name, which is a folder's
 MOST_RUNS = 10_000  # of a sweep, ours: more is a slip of the pen

@@ -23,14 +23,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax.config import Config, shown
+from csac_jax.config import Config
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.metrics import NO_CASES
 from csac_jax.io import checkpoint, configs, files, lock, renames
 from csac_jax.runtime import cluster
 from csac_jax.runtime.signals import Stop
-from csac_jax.section import require
+from csac_jax.section import require, shown
 from csac_jax.sweeps import grid
 from csac_jax.sweeps.replicas import ProgramGroup, SweepProgram, group_configs
 from csac_jax.training import loop, memory

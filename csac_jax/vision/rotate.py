@@ -13,7 +13,6 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.config import canvas_size
 
 CLOSE = 3e-5  # cells or yaws, ours: rounding moves a position among 80 cells by half of it
 
@@ -28,9 +27,8 @@ class RotationTables:
     cell: float = struct.field(pytree_node=False)  # side of a cell, m
 
 
-def tables(size: int, extent: float, rotations: int, count: int, margin: float) -> RotationTables:
+def tables(size: int, extent: float, rotations: int, count: int, canvas: int) -> RotationTables:
     """Makes tables to rotate maps [size, size, ch] of `extent` m by the first `count` of K yaws."""
-    canvas = canvas_size(size, margin)
     along = np.arange(canvas) + 0.5 - 0.5 * canvas  # cells from the centre
     y, x = np.meshgrid(along, along, indexing="ij")
     yaw = (2.0 * np.pi / rotations * np.arange(count))[:, None, None]  # [count, 1, 1]

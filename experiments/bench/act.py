@@ -1,14 +1,13 @@
 """Times the dense Q maps of a state, 2 primitives x 16 yaws, as JSON: `csac-jax bench act
-[--states N] [--upsample N] [--pixels N] [--repeats N]`.
+[--states N] [--pixels N] [--repeats N]`.
 
 DenseNet-121 over colour and height maps of PIXELS (224) cells, one state and STATES (64) at once,
-each cell ZOOM (1) pixels wide, maps as fine as the height map. Then the small net, one critic, at
+each cell a pixel wide, maps as fine as the height map. Then the small net, one critic, at
 the size that it is used at: as it is by default, in `quick` and in `fast`. All weights are random;
 the median of REPEATS (10) calls counts.
 """
 
 import dataclasses
-import math
 import time
 from typing import Any, ClassVar
 
@@ -29,27 +28,18 @@ from experiments.bench._timing import medians
 
 
 class FineDenseNet(DenseNet121):
-    """DenseNet-121 whose maps are as fine as the height map."""
+    """DenseNet-121 whose maps are as fine as the height map, as are the pixels that it sees."""
 
     output_stride: ClassVar[int] = 1
+    upsample: ClassVar[int] = 1
+    canvas_step: ClassVar[int] = DenseNet121.STRIDE
 
 
-def _canvas(pixels: int, multiple: int) -> int:
-    """Returns the side of rotated maps: the diagonal of `pixels` cells, as far as margins allow."""
-    sides = range(-(-pixels // multiple) * multiple, int(1.5 * pixels) + 1, multiple)
-    return next(
-        (side for side in sides if side >= math.sqrt(2.0) * pixels), max(sides, default=pixels)
-    )
-
-
-def _densenet(pixels: int, upsample: int) -> Config:
+def _densenet(pixels: int) -> Config:
     """Returns the preset `paper` for clearing, on maps of `pixels` cells as its height map."""
     paper = presets.paper().change(task={"kind": "clear"})
     try:
-        margin = _canvas(pixels, max(DenseNet121.STRIDE // upsample, 1)) / pixels - 1.0
-        net = FineDenseNet(
-            **dataclasses.asdict(paper.net) | {"pad_fraction": margin, "upsample": upsample}
-        )
+        net = FineDenseNet(**dataclasses.asdict(paper.net))
         return dataclasses.replace(paper, heightmap=HeightmapConfig(size=pixels), net=net)
     except ValueError as error:
         raise SettingsError(f"bench act: {error}") from None
@@ -131,9 +121,9 @@ def _small(net: NetConfig, states: int, repeats: int) -> dict[str, Any]:
 
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    options = read("act", arguments, pixels=224, states=64, upsample=1, repeats=10)
+    options = read("act", arguments, pixels=224, states=64, repeats=10)
     pixels, repeats = options["pixels"], options["repeats"]
-    cfg = _densenet(pixels, options["upsample"])
+    cfg = _densenet(pixels)
     ours = [_ours(cfg, states, repeats) for states in (1, options["states"])]
     nets = {"default": SmallNet(), "quick": presets.quick().net, "fast": presets.fast().net}
     small = {name: _small(net, options["states"], repeats) for name, net in nets.items()}

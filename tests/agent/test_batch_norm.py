@@ -22,7 +22,8 @@ from tests.sections import with_constants
 pytestmark = pytest.mark.optax
 B = 4
 NET = with_constants(
-    DenseNet121(norm="batch", rotations=4, head=8, pad_fraction=0.0, upsample=2),
+    DenseNet121(norm="batch", rotations=4, head=8),
+    pad_fraction=0.0,
     block_layers=(1, 1, 1, 1),
     block_growth=4,
 )

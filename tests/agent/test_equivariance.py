@@ -21,9 +21,12 @@ K = 12  # no yaw of 45 degrees, where the nearest cell of a diagonal is a matter
 QUARTER = K // 4
 SIZE = 96
 NETS = {
-    "small": SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8, pad_fraction=0.5),
+    "small": with_constants(
+        SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8), pad_fraction=0.5
+    ),
     "densenet121": with_constants(
-        DenseNet121(rotations=K, head=8, pad_fraction=0.5, upsample=2),
+        DenseNet121(rotations=K, head=8),
+        pad_fraction=0.5,
         block_layers=(1, 1, 1, 1),
         block_growth=8,
     ),

@@ -6,6 +6,7 @@ from csac_jax import config
 from csac_jax.agent import policy
 from csac_jax.config import PolicyConfig, TargetConfig
 from csac_jax.replay import samplers
+from csac_jax.section import ALTERNATIVES
 from csac_jax.training import transitions
 
 
@@ -15,4 +16,4 @@ def test_tables_are_total():
     assert set(policy.PRIMITIVE_RULES) == choices(PolicyConfig, "primitive")
     assert set(transitions.BOOTSTRAPS) == choices(TargetConfig, "bootstrap")
     assert set(samplers.BUILDERS) == set(typing.get_args(config.ReplayConfig))
-    assert set(samplers.BUILDERS) == set(config.ALTERNATIVES["replay"][1])
+    assert set(samplers.BUILDERS) == set(ALTERNATIVES["replay"][1])

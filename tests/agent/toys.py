@@ -124,9 +124,10 @@ def two_step(cfg: Config) -> Toy:
 
 def config(algo: str, actions: int, max_actions: int, push: float | None = None) -> Config:
     """A small config of an algorithm; `push` replaces what any push earns, before Gamma = 0.5."""
+    net = SmallNet(rotations=4, growth=8, dilations=(1,), stem=8, head=16)
     small = Config(
         heightmap=HeightmapConfig(size=16),
-        net=SmallNet(rotations=4, growth=8, dilations=(1,), stem=8, head=16, pad_fraction=0.25),
+        net=with_constants(net, pad_fraction=0.25),
         cem=CEMConfig(candidates=16, elites=4, rounds=2),
         target=with_constants(TargetConfig(), samples=16),
         explore=ExploreConfig(push_fraction=0.5, epsilon_place=(0.5, 0.1)),

@@ -80,7 +80,7 @@ def run_dir(tmp_path: Path) -> Path:
         ("train quick --learn.tau 2", "learn.tau: must be at most 1, not 2.0"),
         ("train quick --scene.slots box ball", "--scene.slots: 'ball' is not one of: box, arch"),
         ("train quick --replay.sampler best", "replay.sampler: 'best' is not one of: uniform"),
-        ("train quick --net.upsample=2", "--net.upsample=2: --net.kind small has no such setting"),
+        ("train quick --net.norm=batch", "--net.norm=batch: --net.kind small has no such setting"),
         ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
         ("train quick smoke", "unknown arguments: smoke"),
         ("train quick --algo csac_bta", "unknown algorithm 'csac_bta'; did you mean csac_beta?"),
@@ -204,8 +204,8 @@ def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
         ),
         ("--replay.sampler=uniform", {"replay": UniformReplay(capacity=SMOKE.replay.capacity)}),
         (
-            "--net.pad_fraction 0 --net.kind densenet121 --net.upsample 2",
-            {"net": DenseNet121(rotations=4, head=4, pad_fraction=0.0, upsample=2)},
+            "--net.head 8 --net.kind densenet121 --net.norm batch",
+            {"net": DenseNet121(rotations=4, head=8, norm="batch")},
         ),
         (
             "--algo csac --replay.sampler beta --replay.end 1 5",

@@ -137,7 +137,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "grasp": {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}},
 }
 SETTINGS["anywhere"] |= {"net": {"growth": 4, "stem": 4}}
-SETTINGS["grasp"] |= {"net": {"pad_fraction": 0.5}, "learn": {"critics": 2}}
+SETTINGS["grasp"] |= {"heightmap": {"size": 48}, "learn": {"critics": 2}}
 
 
 @pytest.mark.parametrize("name", SETTINGS)

@@ -14,7 +14,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.config import BetaReplay, Config, LearnConfig, SimConfig
+from csac_jax.config import BetaReplay, Config, DenseNet121, LearnConfig, SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files, renames
 from csac_jax.sweeps import grid, runner
@@ -45,7 +45,11 @@ def test_format_is_stored():
     """Claim: the format has a stored file, with the first names of its settings. It is read, and is
     written today under the names of today."""
     stored = json.loads(STORED.read_text())
-    assert renames.current(stored) == _through_text(SAVED) != stored
+    today = renames.current(stored)
+    for section, former in renames.FIXED.items():
+        assert former & today[section].keys()
+        today[section] = {k: v for k, v in today[section].items() if k not in former}
+    assert today == _through_text(SAVED) != stored
     assert configs.from_dict(stored) == SAVED
 
 
@@ -82,6 +86,23 @@ def test_old_names_are_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     (tmp_path / files.SWEEP_PLAN).write_text(runner.plan_text(older))
     assert runner.read_plan(tmp_path) == plan
     assert files.renamed({"a": {"ill": 1}}) == {"a": {"physics_diverged": 1}}
+
+
+def test_former_settings_have_their_constants():
+    """Claim: a stored config or a user's file may hold a former setting at the value of today, and
+    is refused by its name with another value, or where the section never had it."""
+    stored = {"net": {"kind": "small", "stride": 4, "margin": 0.125}}
+    dense = {"net": {"kind": "densenet121", "zoom": 2, "pad_fraction": 0.4286}}
+    number = {"format": configs.FORMAT}
+    wanted = Config().change(net={"stride": 4})
+    assert configs.from_dict(number | stored) == wanted
+    assert configs.from_dict(number | dense).net == DenseNet121()
+    for field, value, message in (
+        ("margin", 0.5, r"net\.pad_fraction: must be 0\.125, not 0\.5"),
+        ("zoom", 2, r"net\.upsample: unknown setting"),
+    ):
+        with pytest.raises(SettingsError, match=f"^{message}$"):
+            configs.from_dict(number | {"net": stored["net"] | {field: value}})
 
 
 def test_differences_are_named_in_order():

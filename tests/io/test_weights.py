@@ -19,9 +19,7 @@ from tests.sections import with_constants
 
 LAYERS, GROWTH = (1, 2, 1, 1), 4
 NET = with_constants(
-    DenseNet121(norm="batch", rotations=4, head=8, pad_fraction=0.0),
-    block_layers=LAYERS,
-    block_growth=GROWTH,
+    DenseNet121(norm="batch", rotations=4, head=8), block_layers=LAYERS, block_growth=GROWTH
 )
 
 

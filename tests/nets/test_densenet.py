@@ -1,6 +1,5 @@
 """DenseNet-121 against Keras 3 with the same weights, and its parts."""
 
-import dataclasses
 import os
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -18,7 +17,7 @@ from csac_jax.config import DenseNet121
 from csac_jax.nets import densenet, networks
 from tests.sections import with_constants
 
-TINY = with_constants(DenseNet121(head=8), block_layers=(1, 1, 1, 1), block_growth=4)
+TINY = with_constants(DenseNet121(head=8), block_layers=(1, 1, 1, 1), block_growth=4, upsample=1)
 PARAMETERS = 7_037_504  # of a trunk without the top, running statistics included
 KERAS = {"norm1": "0_bn", "conv1": "1_conv", "norm2": "1_bn", "conv2": "2_conv"}
 
@@ -82,7 +81,7 @@ def _weights(
 
 def _compare(block_layers: tuple[int, int, int, int], size: int) -> int:
     """Compares every module with Keras's in both modes of batch norm; returns their number."""
-    cfg = with_constants(DenseNet121(norm="batch"), block_layers=block_layers)
+    cfg = with_constants(DenseNet121(norm="batch"), block_layers=block_layers, upsample=1)
     trunk = densenet.DenseNetTrunk(cfg)
     variables = random_variables(trunk, 0, (1, size, size, 3))
     maps = jnp.asarray(np.random.default_rng(1).normal(size=(4, size, size, 3)), jnp.float32)
@@ -166,15 +165,13 @@ def test_number_of_parameters():
     size = lambda entry: sum(leaf.size for leaf in jax.tree.leaves(entry))  # noqa: E731
     sizes = {name: size(entry) for name, entry in variables.items()}
     assert sizes == {"params": PARAMETERS - 83_648, "batch_stats": 83_648}
-    assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 2, 2, 1024)
+    assert jax.eval_shape(trunk.apply, variables, blank).shape == (1, 4, 4, 1024)
     assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.float32.dtype}
 
 
 def test_a_zoomed_trunk_doubles_its_cells():
     """Claim: with a upsample a trunk says of maps what one without says of pixels repeated."""
-    nets = (
-        densenet.DenseNetTrunk(dataclasses.replace(TINY, upsample=upsample)) for upsample in (1, 2)
-    )
+    nets = (densenet.DenseNetTrunk(with_constants(TINY, upsample=upsample)) for upsample in (1, 2))
     whole, doubling = (jax.jit(net.apply) for net in nets)
     maps = jnp.asarray(np.random.default_rng(5).normal(size=(2, 32, 48, 3)), jnp.float32)
     variables = random_variables(densenet.DenseNetTrunk(TINY), 0, (1, 64, 64, 3))
@@ -223,7 +220,7 @@ def test_trunks_have_weights_of_their_own():
 def test_head_upsamples(upsample: int, output_stride: int, factor: int):
     """Claim: maps have the resolution that `output_stride` says; they are bilinear between the
     features' cells, which keep their places, and constant features give a constant map."""
-    cfg = with_constants(DenseNet121(upsample=upsample), output_stride=output_stride)
+    cfg = with_constants(DenseNet121(), upsample=upsample, output_stride=output_stride)
     plane = np.add.outer(3.0 * np.arange(4), np.arange(5))[None, ..., None]
     plane = jnp.asarray(plane, jnp.float32)
     got = np.asarray(densenet._upsample(plane, 32 // (cfg.upsample * cfg.output_stride)))[0, ..., 0]

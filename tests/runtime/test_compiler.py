@@ -28,7 +28,7 @@ def forgotten(monkeypatch: pytest.MonkeyPatch):
 def _convolutions(cfg) -> list[tuple[int, ...]]:
     """Side of the maps, channels in and out, kernel, stride, dilation, padding of each in the small
     net."""
-    side, net = round(cfg.heightmap.size * (1.0 + cfg.net.pad_fraction)), cfg.net
+    side, net = cfg.net.canvas(cfg.heightmap.size), cfg.net
     stem = (side, 4, net.stem, 2 * net.stride, net.stride, 1, net.stride // 2)
     layers = [
         (side // net.stride, net.stem + i * net.growth, net.growth, 3, 1, d, d)

@@ -28,9 +28,10 @@ class Tiny(DenseNet121):
 
     block_layers: ClassVar[tuple[int, int, int, int]] = (1, 1, 1, 1)
     block_growth: ClassVar[int] = 4
+    pad_fraction: ClassVar[float] = 0.0
 
 
-TINY = Tiny(rotations=4, pad_fraction=0.0, head=8, upsample=2)
+TINY = Tiny(rotations=4, head=8)
 
 
 def _still(cfg: Config) -> step.Program:

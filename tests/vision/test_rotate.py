@@ -18,17 +18,14 @@ def _yaw(k: int) -> float:
     return 2.0 * np.pi * k / _K
 
 
-@pytest.mark.parametrize(
-    ("size", "margin", "count"), [(64, 0.25, 16), (48, 0.0, 8), (64, 2**0.5 - 1, 16)]
-)
-def test_frames_agree_with_scipy(size, margin, count):
+@pytest.mark.parametrize(("size", "side", "count"), [(64, 80, 16), (48, 48, 8), (64, 90, 16)])
+def test_frames_agree_with_scipy(size, side, count):
     """Claim: every frame is SciPy's nearest-cell rotation, to half a pixel a side, and 0 outside
     the workspace: an action with the frame's yaw points along +column."""
-    tables = rotate.tables(size, 0.448, _K, count, margin)
+    tables = rotate.tables(size, 0.448, _K, count, side)
     row, col = np.meshgrid(*[np.arange(size, dtype=np.float32)] * 2, indexing="ij")
     maps = jnp.asarray(np.stack([row, col, np.ones_like(row)], axis=-1))
     frames = np.asarray(rotate.rotate(tables, maps))
-    side = tables.canvas
     assert frames.shape == (count, side, side, 3)
     for k in range(count):
         cos, sin = np.cos(_yaw(k)), np.sin(_yaw(k))
@@ -56,10 +53,9 @@ def test_frames_agree_with_scipy(size, margin, count):
 
 def test_quarter_turns_are_exact():
     """Claim: frame 0 is the map in a border of zeros; quarter turns only permute cells."""
-    tables = rotate.tables(64, 0.448, _K, _K, 0.25)
+    tables = rotate.tables(64, 0.448, _K, _K, 80)
     maps = np.random.default_rng(0).normal(size=(64, 64, 3)).astype(np.float32)
     frames = np.asarray(rotate.rotate(tables, jnp.asarray(maps)))
-    assert tables.canvas == 80
     assert np.abs(frames[0]).sum() == pytest.approx(np.abs(maps).sum(), rel=1e-5)
     for quarter in range(4):
         inner = frames[quarter * _K // 4, 8:-8, 8:-8]
@@ -69,7 +65,7 @@ def test_quarter_turns_are_exact():
 
 def test_one_frame_is_that_of_all():
     """Claim: `rotate` with k gives frame k of all, for a traced k, under vmap over maps and k."""
-    tables = rotate.tables(64, 0.448, _K, _K, 0.25)
+    tables = rotate.tables(64, 0.448, _K, _K, 80)
     maps = jnp.asarray(np.random.default_rng(0).normal(size=(5, 64, 64, 4)), jnp.float32)
     k = jnp.array([0, 3, 15, 8, 7], jnp.int32)
     every = jax.vmap(lambda m: rotate.rotate(tables, m))(maps)
@@ -85,7 +81,7 @@ def test_a_block_appears_where_to_cell_says(k, x, y):
     """Claim: a block is seen in the map and in frame k where `to_cell` says, to half a cell."""
     cfg = HeightmapConfig(64)
     block = cubes((x, y, 0.025))
-    tables = rotate.tables(cfg.size, cfg.extent, _K, _K, 0.25)
+    tables = rotate.tables(cfg.size, cfg.extent, _K, _K, 80)
     height = _look(block)
     row, column = np.argwhere(np.asarray(height) > 0.02).mean(0)
     xy = (np.array([column, row]) + 0.5) * cfg.cell - 0.5 * cfg.extent
@@ -115,3 +111,17 @@ def test_bilinear_agrees_with_scipy():
     for i in range(3):
         expected = scipy.ndimage.map_coordinates(values[i], row_col[i].T, order=1, mode="nearest")
         np.testing.assert_allclose(read[i], expected, atol=1e-5)
+
+
+def test_a_small_margin_loses_corners():
+    """Claim: a canvas of sqrt(2) times the map shows corners in every frame, one of 9/8 does not in
+    frame 2."""
+    corners = np.zeros((64, 64, 1), np.float32)
+    corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
+    corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0
+    for canvas, kept in ((90, True), (72, False)):
+        tables = rotate.tables(64, 0.448, _K, _K, canvas)
+        frames = np.asarray(rotate.rotate(tables, jnp.asarray(corners)))
+        turned = [np.rot90(frames[2, :, :, 0], turn) for turn in range(4)]
+        quarters = np.stack(turned)[:, : tables.canvas // 4]
+        assert np.all(quarters.sum((1, 2)) >= 1.0) == kept

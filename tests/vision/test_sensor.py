@@ -195,6 +195,6 @@ def test_the_config_chooses_the_view():
     ],
 )
 def test_bad_settings_are_refused(change: dict, message: str):
-    """Claim: impossible settings of sensor, view, strides or yaws are refused by their name."""
+    """Claim: impossible settings of sensor, view or yaws are refused by their name."""
     with pytest.raises(ValueError, match=message):
         Config().change(**change)
