@@ -90,7 +90,7 @@ class SimConfig(Section, section="sim"):
     adapter: float = number(0.0, 0.0, 0.3)  # Length between the arm's flange and the gripper, m.
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
     down_force: float = number(20.0, 0.0, 200.0, above=True)
-    """Most force of the hand downwards, N; it stops on what it cannot push away (ours: cautious)."""
+    """Most force of the hand downwards, N; what resists more stops it (ours: a cautious arm)."""
     approach: Literal["free", "guarded"] = "free"
     """`guarded`: a hand that meets more than `down_force` on its way down goes back, and nothing
     else happens."""

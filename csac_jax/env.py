@@ -233,7 +233,7 @@ class Env:
         )
 
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
-        """Rotates a scene at random; draws the task's target, varying fingers and a varying grip."""
+        """Rotates a scene at random; draws the target, and fingers and grip where they vary."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
         placed = scene_state.randomise_pose(key, scene, extent, self.any_yaw, has_target)
         placed = scene_state.with_grip(jax.random.fold_in(key, _GRIP), placed, self.cfg.sim)

@@ -29,8 +29,8 @@ def of_scene(world: World, fields: BlockFields, base: Base) -> dict[str, jax.Arr
     }
     changed = {name: base(name).at[index].set(rows) for name, (index, rows) in values.items()}
     if fields.grip is not None:
-        pads = changed["geom_friction"].at[world.hand_geoms[1:], 0]
-        changed["geom_friction"] = pads.set(fields.grip.friction)
+        of_pads = changed["geom_friction"].at[world.hand_geoms[1:], 0]
+        changed["geom_friction"] = of_pads.set(fields.grip.friction)
         force = base("actuator_forcerange").at[world.grip].set(fields.grip.force)
         changed["actuator_forcerange"] = force
     if fields.pads is not None:
