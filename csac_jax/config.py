@@ -71,9 +71,9 @@ class SimConfig(Section, section="sim"):
     """Physics and the two motion primitives; both primitives take `substeps` physics steps."""
 
     timestep: ClassVar[float] = 0.004  # s, of a physics step
-    iterations: ClassVar[int] = 4  # Newton iterations of the solver; fewer break grasps (ours)
+    iterations: ClassVar[int] = 5  # Newton iterations; with 4, pressed packings erupt (ours)
     line_search: ClassVar[int] = 8  # line-search steps of one Newton iteration (ours)
-    approach: ClassVar[float] = 0.10  # m, height above the place where a primitive starts and ends
+    approach_height: ClassVar[float] = 0.10  # m above the place, where a primitive starts and ends
     grasp_depth: ClassVar[float] = 0.035  # m, of the finger tips below the surface (VPG: 0.03-0.04)
     push_length: ClassVar[float] = 0.10  # m (VPG)
     push_depth: ClassVar[float] = 0.02  # m, of the tips below the local top (ours)
@@ -89,9 +89,27 @@ class SimConfig(Section, section="sim"):
     """Pose of the arm's base: x, y, z, m, and yaw, rad (ours: scenes/README.md; for own arms)."""
     adapter: float = number(0.0, 0.0, 0.3)  # Arm's flange to gripper, m (for own arms).
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
+    down_force: float = number(20.0, 0.0, 200.0, above=True)
+    """Most force of the hand downwards, N; what resists more stops it (ours: a cautious arm)."""
+    approach: Literal["free", "guarded"] = "free"
+    """`guarded`: a hand that meets more than `down_force` on its way down goes back, and nothing
+    else happens."""
+    pad_friction: Pair = number((0.0, 0.0), 0.0, 2.0)  # Of the pads, by episode; 0: the gripper's.
+    grip_force: Pair = number((0.0, 0.0), 0.0, 200.0)  # N, by episode; 0: the gripper's.
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
     geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
     contacts: int = number(48, 1)  # Contacts that MJX and Warp keep per step.
+
+    def check(self) -> None:
+        for name in ("pad_friction", "grip_force"):
+            low, high = getattr(self, name)
+            require(low <= high, f"sim.{name}: low <= high is needed")
+            require(low > 0.0 or high == 0.0, f"sim.{name}: both must be above 0, or both 0")
+
+    @property
+    def grip_varies(self) -> bool:
+        """Returns whether an episode draws the grip's friction or force."""
+        return max(self.pad_friction[1], self.grip_force[1]) > 0.0
 
     @property
     def substeps(self) -> int:

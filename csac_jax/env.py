@@ -20,7 +20,7 @@ from flax import struct
 from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
-from csac_jax.grippers import Gripper
+from csac_jax.grippers import Grip, Gripper
 from csac_jax.robot.primitives import Action
 from csac_jax.scenes import pool
 from csac_jax.sim import backend, outcome, physics as simulation
@@ -46,13 +46,14 @@ class ArraySpec:
         return jnp.all((values >= self.minimum) & (values <= self.maximum))
 
 
-_FINGERS = np.uint32(2**30)  # distinct from the other children of a scene's key
+_FINGERS, _GRIP = np.uint32(2**30), np.uint32(2**30 + 1)  # distinct from other children of a key
 _Spec: Any = ArraySpec  # stands where a pytree has an array
 
 
 @struct.dataclass
 class Info:
-    """Effects of the last action. A lifted block that is not the target counts as TOUCHED."""
+    """Effects of the last action. A lifted block that is not the target counts as TOUCHED, and so
+    does a grasp that is blocked."""
 
     outcome: jax.Array  # [] int32, Outcome of a grasp by ground truth; NOTHING after a push
     outcome_by_gap: jax.Array  # [] int32, the same, from finger gap and height map
@@ -62,6 +63,7 @@ class Info:
     blocks_lost: jax.Array  # [] int32, blocks that left the workspace
     contact_overflow: jax.Array  # [] int32, substeps in which contacts may have been dropped
     physics_diverged: jax.Array  # [] bool, physics failed: the transition is void
+    blocked: jax.Array  # [] bool, a guarded descent was stopped: the scene is as before
 
 
 @struct.dataclass
@@ -89,12 +91,13 @@ class _Motion(NamedTuple):
     """One action as physics ran it."""
 
     before: SceneState  # empty where it was invalid
-    after: SceneState  # without blocks that are gone; as before where physics diverged
+    after: SceneState  # without blocks that are gone; as before where undone
     trace: Trace
     surface: jax.Array  # [] m, see `primitives.Plan`
     is_grasp: jax.Array  # [] bool
     hand_rise: jax.Array  # [] m, from the lowest set-point
     diverged: jax.Array  # [] bool, physics failed
+    blocked: jax.Array  # [] bool, a guarded descent was stopped
     lifted: jax.Array  # [N] bool, blocks in the hand
     lost: jax.Array  # [N] bool, blocks that left the workspace
 
@@ -143,10 +146,12 @@ class Env:
         """Starts an episode in this scene. Raises ValueError if sensor noise lacks its key."""
         no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.float32)
         count = jnp.zeros((), jnp.int32)
-        info = Info(count, count, zero, zero, count, count, count, no)
+        info = Info(count, count, zero, zero, count, count, count, no, no)
         gripper = self.gripper
         if gripper.varies is not None and scene.fingers is None:
             scene = scene.replace(fingers=jax.tree.map(jnp.float32, gripper.fingers))
+        if self.cfg.sim.grip_varies and scene.grip is None:
+            scene = scene.replace(grip=Grip(zero, zero))
         noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, count)
         return State(scene, obs, zero, no, no, count, count, count, info, noise_key)
@@ -176,7 +181,8 @@ class Env:
         spec = self.observation_spec
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
         valid &= spec.colour.contains(state.obs.colour)
-        blank = scene_state.parked(self.cfg.scene.slots).replace(fingers=state.scene.fingers)
+        blank = scene_state.parked(self.cfg.scene.slots)
+        blank = blank.replace(fingers=state.scene.fingers, grip=state.scene.grip)
         return _select(valid, state.scene, blank), valid
 
     def _move(
@@ -186,14 +192,17 @@ class Env:
         after, trace, plan = simulation.execute(self.physics, self.cfg, before, height, action)
         finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
         diverged = ~(valid & finite & simulation.healthy(after))
-        after = _select(diverged, before, after)
+        guarded = self.cfg.sim.approach == "guarded"
+        blocked = guarded & outcome.is_stopped(trace, action.primitive) & ~diverged
+        undone = diverged | blocked
+        after = _select(undone, before, after)
         is_grasp = action.primitive == Primitive.GRASP
         hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-        lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~diverged
+        lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~undone
         inside = scene_state.inside(after.position, self.cfg.heightmap.extent)
         lost = after.in_play & ~inside & ~lifted
         after = scene_state.park(after, ~lifted & ~lost)
-        judged = plan.surface, is_grasp, hand_rise, diverged, lifted, lost
+        judged = plan.surface, is_grasp, hand_rise, diverged, blocked, lifted, lost
         return _Motion(before, after, trace, *judged)
 
     def _judge(self, state: State, action: Action, motion: _Motion) -> State:
@@ -224,9 +233,10 @@ class Env:
         )
 
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
-        """Rotates a scene at random; draws the task's target and a varying gripper's fingers."""
+        """Rotates a scene at random; draws the target, and fingers and grip where they vary."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
         placed = scene_state.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        placed = scene_state.with_grip(jax.random.fold_in(key, _GRIP), placed, self.cfg.sim)
         return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
 
     def _sample_scene(self, key: jax.Array) -> SceneState:
@@ -283,18 +293,21 @@ def _info(action: Action, motion: _Motion, success: jax.Array, moved: jax.Array)
     distance = jnp.linalg.norm(motion.before.position[:, :2] - action.pose[:2], axis=1)
     wrong = jnp.any(lifted) & ~success
     best = jnp.where(wrong, jnp.int32(Outcome.TOUCHED), jnp.int32(Outcome.LIFTED))
+    best = jnp.where(motion.blocked, jnp.int32(Outcome.TOUCHED), best)
     best = jnp.where(motion.is_grasp, best, jnp.int32(Outcome.NOTHING))
+    least = jnp.where(motion.blocked, best, jnp.int32(Outcome.NOTHING))
     by_truth = outcome.grasp_outcome(motion.trace, motion.surface, motion.hand_rise)
     by_gap = outcome.grasp_outcome_by_gap(motion.trace, motion.surface, moved > CHANGE_AREA)
     return Info(
-        outcome=jnp.minimum(by_truth, best),
-        outcome_by_gap=jnp.minimum(by_gap, best),
+        outcome=jnp.clip(by_truth, least, best),
+        outcome_by_gap=jnp.clip(by_gap, least, best),
         moved=moved,
         distance=jnp.where(jnp.any(lifted), jnp.min(jnp.where(lifted, distance, jnp.inf)), 0.0),
         cleared=jnp.sum(lifted, dtype=jnp.int32),
         blocks_lost=jnp.sum(motion.lost, dtype=jnp.int32),
         contact_overflow=motion.trace.contact_overflow,
         physics_diverged=motion.diverged,
+        blocked=motion.blocked,
     )
 
 

@@ -33,6 +33,13 @@ class Ends(NamedTuple):
     open: float
 
 
+class Grip(NamedTuple):
+    """What an episode's grip is: numbers, or arrays [...]; 0: the gripper's own."""
+
+    friction: Any  # sliding, of the pads
+    force: Any  # N, most of the drive
+
+
 class FingerSize(NamedTuple):
     """Size of a finger, m."""
 
@@ -66,6 +73,7 @@ class _Shared:
     opening: Ends  # m, between the pads
     depth: Ends  # m, flange to tips
     finger: FingerSize
+    force: float | None = None  # N, of the drive at its limit; None: unknown
     clearance: float  # m, least height of the tips above the table
     radius: float  # m, circle about the tool axis that holds the open hand
     body_radius: float  # m, capsule about the gripper's body
@@ -277,6 +285,7 @@ def _rules(gripper: Gripper) -> Iterator[tuple[str, Any]]:
     """Yields what numbers must be, and if they are; each may rely on those before it."""
     half, depth, finger = gripper.half, gripper.depth, gripper.finger
     numbers = [*gripper.set_points, *sum(gripper.positions, ()), gripper.arc_radius or 0.0]
+    yield "'force' must be above 0", gripper.force is None or 0.0 < gripper.force < math.inf
     yield "'actuator', 'joints' and 'arc_radius' must be finite", np.isfinite(numbers).all()
     words = (gripper.name, gripper.body, gripper.palm, *gripper.pads, gripper.actuator)
     yield "'name', 'body', 'palm', 'pads' and 'actuator.name' must not be empty", all(words)

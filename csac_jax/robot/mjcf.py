@@ -15,8 +15,12 @@ from csac_jax.errors import SceneError
 from csac_jax.grippers import Gripper
 
 PREFIX = "hand/"  # of the gripper's names in the model
+PRESS = PREFIX + "z"  # drive along the tool, which gives way to more than sim.down_force
 ARM_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist1", "wrist2", "wrist3")
 FLOAT_MASS, FLOAT_COM, FLOAT_INERTIA = 1.0, 0.1, 0.002  # kg, m, kg m^2: ours, of all floating hands
+# Of contacts with the gripper, where its MJCF leaves MuJoCo's own: a finger sinks less (ours).
+_GRIPPER_IMPEDANCE = 0.99, 0.995
+_MUJOCO_IMPEDANCE = 0.9, 0.95
 _TOLERANCE = 0.001  # m, ours: between MJCF and numbers
 
 
@@ -32,10 +36,11 @@ class Drive(NamedTuple):
 
 
 _SLIDE, _HINGE = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+_PRESS = Drive("z", _SLIDE, (0.0, 0.0, 1.0), 6000.0, 150.0, 100.0)  # downwards: sim.down_force
 FLOAT = (  # ours
     Drive("x", _SLIDE, (1.0, 0.0, 0.0), 6000.0, 150.0, 150.0),
     Drive("y", _SLIDE, (0.0, 1.0, 0.0), 6000.0, 150.0, 150.0),
-    Drive("z", _SLIDE, (0.0, 0.0, 1.0), 6000.0, 150.0, 100.0),
+    _PRESS,
     Drive("yaw", _HINGE, (0.0, 0.0, 1.0), 60.0, 1.2, 10.0),
 )
 
@@ -51,18 +56,25 @@ def joint_names(sim: SimConfig, gripper: Gripper) -> list[str]:
     fingers = [PREFIX + name for name in gripper.joints]
     if sim.robot == "hand":
         return [PREFIX + drive.name for drive in FLOAT] + fingers
-    return [f"{sim.robot}/{name}" for name in ARM_JOINTS] + fingers
+    return [f"{sim.robot}/{name}" for name in ARM_JOINTS] + [PRESS] + fingers
 
 
 def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
     """Adds the robot of a config. Raises SceneError for MJCF that does not fit."""
     tool = read(gripper.folder / grippers.MJCF)
     _check(tool, gripper)
+    for geom in tool.geoms:
+        if tuple(geom.solimp[:2]) == _MUJOCO_IMPEDANCE:
+            geom.solimp[:2] = _GRIPPER_IMPEDANCE
     if sim.robot == "hand":
         _add_floating(spec, tool, gripper)
+        place = {"frame": spec.worldbody.add_frame()}
     else:
         _add_arm(spec, sim, gripper)
-        spec.attach(tool, prefix=PREFIX, site=spec.site(f"{sim.robot}/tip"))
+        _add_drive(spec, tool.body(gripper.body), _PRESS)
+        place = {"site": spec.site(f"{sim.robot}/tip")}
+    spec.attach(tool, prefix=PREFIX, **place)
+    spec.actuator(PRESS).forcerange[0] = -sim.down_force
 
 
 def read(path: Path) -> mujoco.MjSpec:
@@ -111,12 +123,15 @@ def _add_floating(spec: mujoco.MjSpec, tool: mujoco.MjSpec, gripper: Gripper) ->
     root.explicitinertial, root.mass, root.ipos = True, FLOAT_MASS, [0.0, 0.0, FLOAT_COM]
     root.inertia, root.iquat = [FLOAT_INERTIA] * 3, [1.0, 0.0, 0.0, 0.0]
     for drive in FLOAT:
-        root.add_joint(name=drive.name, type=drive.kind, axis=drive.axis)
-        actuator = spec.add_actuator(name=PREFIX + drive.name, target=PREFIX + drive.name)
-        actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        actuator.set_to_position(kp=drive.kp, kv=drive.kv)
-        actuator.forcerange = [-drive.force, drive.force]
-    spec.attach(tool, prefix=PREFIX, frame=spec.worldbody.add_frame())
+        _add_drive(spec, root, drive)
+
+
+def _add_drive(spec: mujoco.MjSpec, root: mujoco.MjsBody, drive: Drive) -> None:
+    root.add_joint(name=drive.name, type=drive.kind, axis=drive.axis)
+    actuator = spec.add_actuator(name=PREFIX + drive.name, target=PREFIX + drive.name)
+    actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
+    actuator.set_to_position(kp=drive.kp, kv=drive.kv)
+    actuator.forcerange = [-drive.force, drive.force]
 
 
 def _add_arm(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:

@@ -15,6 +15,7 @@ from csac_jax.robot import kinematics
 
 BLOCK = 0.05  # m, height of a common block
 START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
+DESCENT_SHARE = 0.75  # of its time that a guarded descent takes; then the hand comes to rest (ours)
 
 
 @struct.dataclass
@@ -85,11 +86,11 @@ def plan(
     depth = jnp.where(is_grasp, grasp_depth(cfg, gripper), cfg.push_depth)
     low = jnp.maximum(surface - depth, lowest(cfg, gripper))
     around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
-    high = jnp.maximum(low + cfg.approach, around + START_GAP)
+    high = jnp.maximum(low + cfg.approach_height, around + START_GAP)
     end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
     closed = gripper.half[0]
     opening = jnp.where(is_grasp, 0.5 * fingers.opening, closed)
-    phases = jnp.where(is_grasp, _progress(cfg.grasp_phases), _progress(cfg.push_phases))
+    phases = jnp.where(is_grasp, _progress(cfg, cfg.grasp_phases), _progress(cfg, cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
     place = xy[None] + act[:, None] * (end - xy)[None]
@@ -106,7 +107,7 @@ def reachable(
         return jnp.ones((), bool)
     low, is_push = lowest(cfg, grippers.load(cfg.gripper)), primitive == Primitive.PUSH
     ends = xy, jnp.where(is_push, _push_end(cfg, heightmap, xy, yaw), xy)
-    tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach + BLOCK)]
+    tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach_height + BLOCK)]
     return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
 
 
@@ -125,11 +126,12 @@ def lowest(cfg: SimConfig, gripper: Gripper) -> float:
     return cfg.clearance or gripper.clearance
 
 
-def _progress(phases: tuple[int, int, int]) -> np.ndarray:
+def _progress(cfg: SimConfig, phases: tuple[int, int, int]) -> np.ndarray:
     """Returns the progress of each phase, 0 to 1, at every substep, [3, T]."""
     times, lengths = np.arange(1, sum(phases) + 1), np.array(phases)[:, None]
     starts = np.cumsum(lengths, axis=0) - lengths
-    linear = np.clip((times - starts) / lengths, 0, 1)
+    share = np.array([DESCENT_SHARE if cfg.approach == "guarded" else 1.0, 1.0, 1.0])[:, None]
+    linear = np.clip((times - starts) / (share * lengths), 0, 1)
     linear[2] = linear[2] ** 2 * (3.0 - 2.0 * linear[2])  # a jerky lift shakes blocks loose
     return linear.astype(np.float32)
 
@@ -137,7 +139,8 @@ def _progress(phases: tuple[int, int, int]) -> np.ndarray:
 def joint_trajectory(cfg: SimConfig, plan: Plan) -> JointTrajectory:
     """Converts a plan to joint set-points: as they are for the hand, by an arm's inverse.
 
-    Tips that close on an arc get lower: the hand rises by as much.
+    Tips that close on an arc get lower: the hand rises by as much. An arm's tool has a drive of its
+    own along its axis, whose set-point is 0.
     """
     gripper = grippers.load(cfg.gripper)
     control = jnp.concatenate([plan.start[None], plan.control])
@@ -150,5 +153,6 @@ def joint_trajectory(cfg: SimConfig, plan: Plan) -> JointTrajectory:
     else:
         arm, home = kinematics.arm(cfg), jnp.asarray(kinematics.HOME)
         moved, reachable = kinematics.joint_targets(arm, home, control)
+        moved = jnp.pad(moved, ((0, 0), (0, 1)))
     targets = jnp.concatenate([moved[1:], set_point], axis=1)
     return JointTrajectory(jnp.concatenate([moved[0], start]), targets, reachable)

@@ -95,7 +95,8 @@ class CPhysics:
         touching = sensed.reshape(substeps.touching.shape) > 0.0
         rise = np.float32(qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2])
         gap = np.float32(world.gripper.gap(qpos[:, world.finger_qpos]))
-        return moved, substeps.replace(touching=touching, rise=rise, gap=gap)
+        lag = np.float32(qpos[:, world.press_qpos] - joints.control[:, world.press])
+        return moved, substeps.replace(touching=touching, rise=rise, gap=gap, lag=lag)
 
 
 class Trajectory(NamedTuple):

@@ -40,7 +40,8 @@ class MjxPhysics:
             touching, overflow = _touch(world, data)
             rise = data.qpos[world.block_qpos[:, 2]] - scene.position[:, 2]
             gap = world.gripper.gap(data.qpos[world.finger_qpos], jnp)
-            return data, Substep(touching, rise, gap, overflow)
+            lag = data.qpos[world.press_qpos] - control[world.press]
+            return data, Substep(touching, rise, gap, lag, overflow)
 
         with jax.default_matmul_precision("highest"):
             data, substeps = jax.lax.scan(substep, initial, joints.control)

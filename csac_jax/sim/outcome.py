@@ -11,6 +11,7 @@ from csac_jax.config import SimConfig
 from csac_jax.constants import Outcome
 
 LIFT_SHARE = 0.5  # a block counts as lifted when it rose by this share of the hand's rise
+STOPPED = 0.008  # m, a guarded descent that ends so far above its set-point was stopped (ours)
 GRIP_RISE = 0.01  # m, a held block that rose this far was grasped
 BARE = 0.01  # m, a surface lower than this is bare table
 CLOSED_GAP = 0.005  # m, a smaller finger gap is a closed hand
@@ -23,6 +24,7 @@ class Substep:
     touching: jax.Array  # [3, N] bool, palm, low pad and high pad against each block
     rise: jax.Array  # [N] m, height gained since the primitive began
     gap: jax.Array  # [] m, between the fingers, beyond that of the closed hand
+    lag: jax.Array  # [] m, of the hand above its set-point
     contact_overflow: jax.Array  # [] bool, contacts may be missing
 
 
@@ -31,9 +33,10 @@ class Trace:
     """Sensor readings of a whole primitive. N = block slots."""
 
     touched: jax.Array  # [] bool, the hand met a block
-    held_rise: jax.Array  # [N] m, largest rise of a block between both pads
-    held: jax.Array  # [N] bool, between both pads in the end
+    held_rise: jax.Array  # [N] m, largest rise of a block in the grip
+    held: jax.Array  # [N] bool, in the grip in the end
     rise: jax.Array  # [N] m, in the end
+    lag: jax.Array  # [2] m, of the hand above its set-point after the descent, by Primitive
     gap_closed: jax.Array  # [] m, finger gap when the hand had closed
     gap_end: jax.Array  # [] m, finger gap in the end
     contact_overflow: jax.Array  # [] int32, substeps in which contacts may be missing
@@ -43,17 +46,29 @@ def nothing_seen(substeps: int, num: int) -> Substep:
     """Returns the substeps of a primitive without motion, NumPy leaves [T, ...], all 0."""
     zeros: Any = np.zeros
     touching, rise = zeros((substeps, 3, num), bool), zeros((substeps, num), np.float32)
-    return Substep(touching, rise, zeros(substeps, np.float32), zeros(substeps, bool))
+    length = zeros(substeps, np.float32)
+    return Substep(touching, rise, length, length, zeros(substeps, bool))
+
+
+def in_grip(touching: jax.Array) -> jax.Array:
+    """Returns [..., N] bool, a block touches a pad while each pad [..., 3, N] touches some block.
+
+    So two blocks side by side between the pads are held, too.
+    """
+    pads = touching[..., 1:, :]
+    return jnp.any(pads, axis=-2) & jnp.all(jnp.any(pads, axis=-1), axis=-1)[..., None]
 
 
 def trace_of(cfg: SimConfig, substeps: Substep) -> Trace:
     """Summarises all substeps of a primitive, leaves [T, ...]."""
-    held = substeps.touching[:, 1] & substeps.touching[:, 2]
+    held = in_grip(substeps.touching)
+    descents = [cfg.push_phases[0] - 1, cfg.grasp_phases[0] - 1]  # by Primitive
     return Trace(
         touched=jnp.any(substeps.touching),
         held_rise=jnp.max(substeps.rise, axis=0, initial=0.0, where=held),
         held=held[-1],
         rise=substeps.rise[-1],
+        lag=substeps.lag[np.array(descents)],
         gap_closed=substeps.gap[sum(cfg.grasp_phases[:2]) - 1],
         gap_end=substeps.gap[-1],
         contact_overflow=jnp.sum(substeps.contact_overflow, dtype=jnp.int32),
@@ -61,8 +76,13 @@ def trace_of(cfg: SimConfig, substeps: Substep) -> Trace:
 
 
 def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
-    """Returns [N] bool, a block hangs in the hand after it rose by `hand_rise` [] m."""
-    return trace.held & (trace.rise >= LIFT_SHARE * hand_rise)
+    """Returns [N] bool, a block rose with the hand, by `hand_rise` [] m, which holds something."""
+    return jnp.any(trace.held) & (trace.rise >= LIFT_SHARE * hand_rise)
+
+
+def is_stopped(trace: Trace, primitive: jax.Array) -> jax.Array:
+    """Returns [] bool, the hand met more than `sim.down_force` on a guarded way down."""
+    return trace.lag[primitive] > STOPPED
 
 
 def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax.Array:

@@ -39,6 +39,7 @@ FIELDS = {  # of MuJoCo's model, that differ per scene, [E, ...]
     "body_invweight0": wp.array2d[wp.vec2],
     "dof_invweight0": wp.array2d[float],
 }
+GRIP_FIELDS = {"actuator_forcerange": wp.array2d[wp.vec2]}  # where the grip varies
 OBJECT_FIELDS = {  # further ones, of objects
     "geom_dataid": wp.array2d[int],
     "geom_quat": wp.array2d[wp.quat],
@@ -51,6 +52,7 @@ _TRACE = {  # leaves of `outcome.Trace`; gaps are positions of the finger's join
     "held_rise": wp.array2d[float],
     "held": wp.array2d[wp.bool],
     "rise": wp.array2d[float],
+    "lag": wp.array2d[float],
     "gap_closed": wp.array[float],
     "gap_end": wp.array[float],
     "contact_overflow": wp.array[float],  # of whole numbers, see `warp_physics`
@@ -82,7 +84,8 @@ def _mark_touch(
     margin: wp.array[float],
     slot_of_geom: wp.array[int],  # [G], -1: no block
     part_of_geom: wp.array[int],  # [G] 0 palm, 1 and 2 pads, -1: not of the hand
-    touching: wp.array3d[int],  # [E, 3, N]
+    done: wp.array[int],
+    touching: wp.array3d[int],  # [E, 3, N] last substep in which they did
 ):
     """Marks which part of the hand touches which block, from the contacts of the last step."""
     contact = wp.tid()
@@ -93,7 +96,8 @@ def _mark_touch(
         part = part_of_geom[pair[side]]
         slot = slot_of_geom[pair[1 - side]]
         if part >= 0 and slot >= 0:
-            touching[scenes[contact], part, slot] = 1  # other threads write the same
+            scene = scenes[contact]
+            touching[scene, part, slot] = done[scene]  # other threads write the same
 
 
 @wp.func
@@ -108,9 +112,12 @@ def _limited(value: float, limit: float):
 
 @wp.kernel
 def _observe(
+    low_after: wp.vec2i,  # substeps of a push's descent, of a grasp's
     closed_after: int,
     lost_contacts: int,
     finger: int,
+    press_qpos: int,
+    press: int,
     position: wp.array[int],  # [N] first address of a block in qpos
     velocity: wp.array[int],  # [N] and in qvel
     limit: wp.array[float],  # [6]
@@ -118,6 +125,7 @@ def _observe(
     in_play: wp.array2d[wp.bool],  # [E, N]
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
+    ctrl: wp.array2d[float],
     touching: wp.array3d[int],
     overflow: wp.array[int],
     done: wp.array[int],
@@ -125,6 +133,7 @@ def _observe(
     held_rise: wp.array2d[float],
     held: wp.array2d[wp.bool],
     rise: wp.array2d[float],
+    lag: wp.array2d[float],
     gap_closed: wp.array[float],
     gap_end: wp.array[float],
     contact_overflow: wp.array[float],
@@ -143,21 +152,27 @@ def _observe(
             qpos[scene, first + i] = start[scene, first + i]
 
     gained = qpos[scene, first + 2] - start[scene, first + 2]
-    palm = touching[scene, 0, slot]
-    low = touching[scene, 1, slot]
-    high = touching[scene, 2, slot]
-    between = low + high == 2
-    if palm + low + high > 0:
+    now = done[scene]
+    low = touching[scene, 1, slot] == now
+    high = touching[scene, 2, slot] == now
+    if low or high or touching[scene, 0, slot] == now:
         touched[scene] = True  # other threads write the same
+    low_holds = False
+    high_holds = False
+    for other in range(touching.shape[2]):
+        low_holds = low_holds or touching[scene, 1, other] == now
+        high_holds = high_holds or touching[scene, 2, other] == now
+    between = (low or high) and low_holds and high_holds
     held[scene, slot] = between
     rise[scene, slot] = gained
     if between and gained > held_rise[scene, slot]:
         held_rise[scene, slot] = gained
-    for part in range(3):
-        touching[scene, part, slot] = 0
 
     if slot == 0:
-        if done[scene] == closed_after:
+        for kind in range(2):
+            if now == low_after[kind]:
+                lag[scene, kind] = qpos[scene, press_qpos] - ctrl[scene, press]
+        if now == closed_after:
             gap_closed[scene] = qpos[scene, finger]
         gap_end[scene] = qpos[scene, finger]
         if (overflow[scene] & lost_contacts) != 0:
@@ -170,7 +185,7 @@ class Batch:
 
     def __init__(self, world: World, cfg: SimConfig, scenes: int) -> None:
         self.substeps = substeps = steps(cfg)
-        names = fields(world)
+        names = fields(world, cfg)
         self.model, self.data = _put(world.model, cfg, scenes, names)
         slots, parts = len(world.slots), len(world.hand_geoms)
         part_of_geom = np.full(world.model.ngeom, -1)
@@ -178,10 +193,17 @@ class Batch:
         self._hand_and_blocks = [
             wp.array(index, dtype=int) for index in (world.slot_of_geom, part_of_geom)
         ]
+
+        def after(phases: tuple[int, ...]) -> int:
+            return round(sum(phases) * substeps / cfg.substeps)
+
         self._constants = [
-            round(sum(cfg.grasp_phases[:2]) * substeps / cfg.substeps),
+            wp.vec2i(after(cfg.push_phases[:1]), after(cfg.grasp_phases[:1])),
+            after(cfg.grasp_phases[:2]),
             _LOST_CONTACTS,
             world.finger_qpos,
+            world.press_qpos,
+            world.press,
             wp.array(world.block_qpos[:, 0], dtype=int),
             wp.array(world.block_dofs[:, 0], dtype=int),
             wp.array(scene_state.SPEED_LIMIT, dtype=float),
@@ -196,7 +218,7 @@ class Batch:
         self._touching = wp.zeros((scenes, parts, slots), dtype=int)
         self._done = wp.zeros(scenes, dtype=int)
         self._trace = [
-            wp.zeros((scenes, slots)[: kind.ndim], dtype=kind.dtype) for kind in _TRACE.values()
+            wp.zeros(_shape(name, scenes, slots), dtype=kind.dtype) for name, kind in _TRACE.items()
         ]
         self._advance = self.recorded(self.substep)
 
@@ -236,9 +258,9 @@ class Batch:
         wp.launch(
             _mark_touch,
             data.naconmax,
-            [data.naconmax, *contacts, *self._hand_and_blocks, self._touching],
+            [data.naconmax, *contacts, *self._hand_and_blocks, self._done, self._touching],
         )
-        state = [data.qpos, data.qvel, self._touching, data.overflow, self._done]
+        state = [data.qpos, data.qvel, data.ctrl, self._touching, data.overflow, self._done]
         wp.launch(
             _observe,
             self._in_play.shape,
@@ -246,9 +268,15 @@ class Batch:
         )
 
 
-def fields(world: World) -> dict[str, Any]:
+def fields(world: World, cfg: SimConfig) -> dict[str, Any]:
     """Returns the fields of MuJoCo's model that differ per scene, and their types."""
-    return FIELDS | ({} if world.objects is None else OBJECT_FIELDS)
+    of_objects = {} if world.objects is None else OBJECT_FIELDS
+    return FIELDS | of_objects | (GRIP_FIELDS if cfg.grip_varies else {})
+
+
+def _shape(name: str, scenes: int, slots: int) -> tuple[int, ...]:
+    """Returns the shape of a leaf of the trace."""
+    return (scenes, 2) if name == "lag" else (scenes, slots)[: _TRACE[name].ndim]
 
 
 def steps(cfg: SimConfig) -> int:
@@ -292,7 +320,7 @@ class WarpSimulator:
         self.batches: dict[tuple[Any, int], Batch] = {}
         """By device and scenes; made by the first action of so many scenes, or by `prepared`."""
         self._world, self._cfg = world, cfg
-        self.arguments = {**fields(world), **_STATE, **_COMMAND}
+        self.arguments = {**fields(world, cfg), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
         self._callable = wp.jax_callable(
             _annotated(self._run, list(self.arguments.items()), list(self._results.items())),
@@ -302,7 +330,7 @@ class WarpSimulator:
 
     def __call__(self, **arrays: jax.Array) -> dict[str, jax.Array]:
         model, (scenes, slots) = self._world.model, arrays["in_play"].shape
-        shapes = {name: (scenes, slots)[: kind.ndim] for name, kind in _TRACE.items()}
+        shapes = {name: _shape(name, scenes, slots) for name in _TRACE}
         shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}
         dims = {f"{name}_out": shape for name, shape in shapes.items()}
         results = self._callable(*(arrays[name] for name in self.arguments), output_dims=dims)

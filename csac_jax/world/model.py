@@ -18,8 +18,9 @@ from csac_jax import grippers
 from csac_jax.assets import assets
 from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig, SlotKind
 from csac_jax.errors import SceneError
-from csac_jax.grippers import Fingers, Gripper
+from csac_jax.grippers import NUMBERS, Fingers, Grip, Gripper
 from csac_jax.robot import mjcf
+from csac_jax.section import require
 from csac_jax.world import blocks, object_models as objects, object_slots, scene_state
 from csac_jax.world.blocks import Parts
 from csac_jax.world.object_models import Bodies, ObjectFields
@@ -51,6 +52,9 @@ class World:
     slot_of_geom: np.ndarray  # [geoms] slot that a geom belongs to, -1 if it is no block's
     robot_qpos: np.ndarray  # [Q] addresses in qpos, the gripper's joints last
     gripper: Gripper
+    press_qpos: int  # address in qpos of the joint that gives way to more than sim.down_force
+    press: int  # its actuator
+    grip: int  # actuator of the fingers
     hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
     mesh_scale: float  # size of compiled meshes of blocks relative to nominal
     objects: Bodies | None = None  # of slots of kind object; None without such slots
@@ -137,9 +141,12 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 def build(scene: SceneConfig, sim: SimConfig) -> World:
     """Builds the world of table, robot and block slots; blocks parked, at their largest size.
 
-    Raises SceneError for MJCF that lacks a named element, does not compile, or that MJX ignores.
+    Raises SceneError for MJCF that lacks a named element, does not compile, or that MJX ignores,
+    and SettingsError for a grip force of a gripper that does not say its own.
     """
     gripper = grippers.load(sim.gripper)
+    knows_force = sim.grip_force[1] == 0.0 or gripper.force is not None
+    require(knows_force, f"sim.grip_force: '{gripper.name}' has no 'force' in its {NUMBERS}")
     with mjcf.errors_of(assets()):
         model = _spec(scene, sim, gripper).compile()
     for field in _MJX_IGNORES if sim.physics == "mjx" else ():  # `put_model` raises for others
@@ -167,6 +174,9 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         slot_of_geom=slot_of_geom,
         robot_qpos=np.array([model.joint(name).qposadr[0] for name in joints]),
         gripper=gripper,
+        press_qpos=int(model.joint(mjcf.PRESS).qposadr[0]),
+        press=model.actuator(mjcf.PRESS).id,
+        grip=model.actuator(mjcf.PREFIX + gripper.actuator).id,
         hand_geoms=np.array([model.geom(name).id for name in mjcf.hand_geoms(gripper)]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
         objects=bodies_of,
@@ -191,6 +201,13 @@ class PadFields(NamedTuple):
     radius: jax.Array  # [2] m
 
 
+class GripFields(NamedTuple):
+    """What the fingers hold by."""
+
+    friction: jax.Array  # [] sliding friction of the pads
+    force: jax.Array  # [2] most of the fingers' actuator, each way, in its unit
+
+
 @struct.dataclass
 class BlockFields:
     """Model fields that differ per scene. N = slots, G = parts, M = meshes."""
@@ -207,6 +224,7 @@ class BlockFields:
     mesh_scale: jax.Array  # [M] relative to the compiled mesh
     objects: ObjectFields | None = None  # rows of such slots in the other leaves have no meaning
     pads: PadFields | None = None  # where the fingers vary
+    grip: GripFields | None = None  # where the grip varies
 
 
 def scene_fields(world: World, scene: SceneState) -> BlockFields:
@@ -219,6 +237,8 @@ def scene_fields(world: World, scene: SceneState) -> BlockFields:
     fields = _with_meshes(world, scene, _box_fields(world, scene))
     if scene.fingers is not None:
         fields = fields.replace(pads=_pads(world, scene.fingers))
+    if scene.grip is not None:
+        fields = fields.replace(grip=_grip(world, scene.grip))
     if world.objects is None:
         return fields
     leaves = (scene.numbers, scene.density, scene.friction)
@@ -234,6 +254,16 @@ def _pads(world: World, fingers: Fingers) -> PadFields:
     along = np.sign(model.geom_pos[pads, 0]) * size[:, 0]
     position = jnp.asarray(model.geom_pos[pads], jnp.float32).at[:, 0].set(along)
     return PadFields(size, position, jnp.linalg.norm(size, axis=1))
+
+
+def _grip(world: World, grip: Grip) -> GripFields:
+    model, own = world.model, world.gripper.force or 1.0
+    share = jnp.where(grip.force > 0.0, grip.force / own, 1.0)
+    friction = np.float32(model.geom_friction[world.hand_geoms[1], 0])
+    return GripFields(
+        friction=jnp.where(grip.friction > 0.0, grip.friction, friction),
+        force=share * np.float32(model.actuator_forcerange[world.grip]),
+    )
 
 
 def _box_fields(world: World, scene: SceneState) -> BlockFields:
@@ -327,6 +357,9 @@ def with_blocks(
     if fields.pads is not None:
         pads = world.hand_geoms[1:]
         model.geom_size[pads], model.geom_pos[pads], model.geom_rbound[pads] = fields.pads
+    if fields.grip is not None:
+        model.geom_friction[world.hand_geoms[1:], 0] = fields.grip.friction
+        model.actuator_forcerange[world.grip] = fields.grip.force
     if world.objects is not None and fields.objects is not None:
         objects.put(model, world.objects, fields.objects)
     mujoco.mj_setConst(model, scratch)  # C takes a free body's mass matrix from `dof_M0`

@@ -8,8 +8,8 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.config import SlotKind
-from csac_jax.grippers import Fingers, Gripper
+from csac_jax.config import SimConfig, SlotKind
+from csac_jax.grippers import Fingers, Grip, Gripper
 from csac_jax.world import blocks
 
 NOMINAL_DENSITY = 600.0  # kg/m^3, wood
@@ -36,6 +36,7 @@ class SceneState:
     target: jax.Array  # [] int32, slot of the block to get; ANY if any block will do
     object_id: jax.Array | None = None  # [N] int32, number in the library; None without objects
     fingers: Fingers | None = None  # [] float32 m, the episode's; None: the gripper's own
+    grip: Grip | None = None  # [] float32, the episode's; None: the gripper's own
 
     @property
     def numbers(self) -> jax.Array:
@@ -95,6 +96,14 @@ def with_fingers(key: jax.Array, scene: SceneState, gripper: Gripper) -> SceneSt
         return scene
     low, high = (np.array(ends, np.float32) for ends in gripper.varies)
     return scene.replace(fingers=Fingers(*jax.random.uniform(key, (3,), minval=low, maxval=high)))
+
+
+def with_grip(key: jax.Array, scene: SceneState, cfg: SimConfig) -> SceneState:
+    """Samples friction and force of an episode's grip, if the config has ranges of them."""
+    if not cfg.grip_varies:
+        return scene
+    low, high = np.array([cfg.pad_friction, cfg.grip_force], np.float32).T
+    return scene.replace(grip=Grip(*jax.random.uniform(key, (2,), minval=low, maxval=high)))
 
 
 def fingers(scene: SceneState, gripper: Gripper) -> Fingers:

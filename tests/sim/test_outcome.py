@@ -21,7 +21,7 @@ def _trace(
 ) -> Trace:
     """A trace in which block 1 of 2 has these values and block 0 lies untouched."""
     blocks = [[0.0, held_rise], [False, held], [0.0, rise]]
-    leaves = (touched, *blocks, gap_closed, gap_end)
+    leaves = (touched, *blocks, [0.0, 0.0], gap_closed, gap_end)
     return Trace(*(jnp.array(leaf) for leaf in leaves), contact_overflow=jnp.int32(0))
 
 
@@ -32,13 +32,15 @@ def test_trace_is_that_of_substeps_seen_one_by_one():
     """Claim: a trace is what one who sees the substeps in turn remembers."""
     rng = np.random.default_rng(0)
     rise, gap = rng.normal(size=(6, 3)).astype(np.float32), rng.random(6).astype(np.float32)
-    seen = Substep(rng.random((6, 3, 3)) < 0.4, rise, gap, rng.random(6) < 0.5)
+    lag = rng.random(6).astype(np.float32)
+    seen = Substep(rng.random((6, 3, 3)) < 0.4, rise, gap, lag, rng.random(6) < 0.5)
     highest, touched, overflows = np.zeros(3, np.float32), False, 0
     for touching, height, overflow in zip(seen.touching, rise, seen.contact_overflow, strict=True):
-        held = touching[1] & touching[2]
+        held = (touching[1] | touching[2]) & touching[1].any() & touching[2].any()
         highest = np.where(held, np.maximum(highest, height), highest)
         touched, overflows = touched or touching.any(), overflows + int(overflow)
-    wanted = Trace(touched, highest, held, height, gap[1], gap[-1], np.int32(overflows))
+    lags = lag[[CLOSES_AT_1.push_phases[0] - 1, 0]]
+    wanted = Trace(touched, highest, held, height, lags, gap[1], gap[-1], np.int32(overflows))
     trace = outcome.trace_of(CLOSES_AT_1, jax.tree.map(jnp.asarray, seen))
     jax.tree.map(np.testing.assert_array_equal, trace, wanted)
 

@@ -22,8 +22,9 @@ from csac_jax.sim.quiet_mjx import mjx
 SIM, MAP = SimConfig(robot="ur5"), HeightmapConfig()
 RG2 = grippers.load("rg2")
 CUBE = 0.025  # m, half its side
-FINGER = 6  # address in qpos of the first finger, after the six joints
-BLOCK = 8  # address in qpos of the block
+JOINTS = 6
+FINGER = 7  # address in qpos of the first finger, after the six joints and the tool's drive
+BLOCK = 9  # address in qpos of the block
 
 _joints = jax.jit(functools.partial(primitives.joint_trajectory, SIM))
 
@@ -47,20 +48,20 @@ def _model(with_block: bool = False) -> mujoco.MjModel:
 
 @functools.cache
 def _plan(primitive: Primitive, x: float, y: float, yaw: float, top: float) -> tuple:
-    """Set-points [1 + T, 5] of a primitive over a flat surface, and joint targets [1 + T, 7]."""
+    """Set-points [1 + T, 5] of a primitive over a flat surface, and joint targets [1 + T, 8]."""
     action = Action(primitive=jnp.int32(primitive), pose=jnp.array([x, y, yaw], jnp.float32))
     height = jnp.full((MAP.size, MAP.size), top)
     plan = jax.jit(functools.partial(primitives.plan, SIM, MAP))(height, action)
     joints = _joints(plan)
     assert joints.reachable
-    target = jnp.concatenate([joints.start[None, :7], joints.control])
+    target = jnp.concatenate([joints.start[None, : FINGER + 1], joints.control])
     return np.concatenate([plan.start[None], plan.control]), np.asarray(target)
 
 
 def _start(model: mujoco.MjModel, target: np.ndarray, block: Any = (9.0, 9.0)) -> mujoco.MjData:
     data = mujoco.MjData(model)
-    data.qpos[:FINGER] = target[0, :6]
-    data.qpos[FINGER : FINGER + 2] = target[0, 6]
+    data.qpos[:FINGER] = target[0, :FINGER]
+    data.qpos[FINGER : FINGER + 2] = target[0, FINGER]
     if model.nq > BLOCK:
         data.qpos[BLOCK : BLOCK + 7] = [*block, CUBE, 1, 0, 0, 0]
     return data
@@ -143,7 +144,7 @@ def test_arm_follows_the_plan_in_mjx():
     def run(qpos, commands):
         def substep(data, command):
             data = mjx_step.step(device, data.replace(ctrl=command))
-            return data, data.qpos[:FINGER]
+            return data, data.qpos[:JOINTS]
 
         return jax.lax.scan(substep, blank.replace(qpos=qpos), commands)[1]
 
