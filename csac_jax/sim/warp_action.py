@@ -157,12 +157,14 @@ def _observe(
     high = touching[scene, 2, slot] == now
     if low or high or touching[scene, 0, slot] == now:
         touched[scene] = True  # other threads write the same
-    low_holds = False
-    high_holds = False
+    on_low = wp.int32(0)
+    on_high = wp.int32(0)
     for other in range(touching.shape[2]):
-        low_holds = low_holds or touching[scene, 1, other] == now
-        high_holds = high_holds or touching[scene, 2, other] == now
-    between = (low or high) and low_holds and high_holds
+        if touching[scene, 1, other] == now:
+            on_low += 1
+        if touching[scene, 2, other] == now:
+            on_high += 1
+    between = (low or high) and on_low > 0 and on_high > 0
     held[scene, slot] = between
     rise[scene, slot] = gained
     if between and gained > held_rise[scene, slot]:

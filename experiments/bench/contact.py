@@ -101,11 +101,9 @@ def _poses(scene: SceneState, step: float, yaws: int) -> np.ndarray:
 
 def measure(step: int, yaws: int, warp: bool) -> dict[str, Any]:
     """Measures shares of lifts and depths; places are `step` mm apart."""
-    places = np.arange(-72.0, 72.1, step) / 1e3
-    poses = np.array(
-        [[x, y, np.pi * k / yaws] for x in places for y in places for k in range(yaws)]
-    )
-    result: dict[str, Any] = {"grasps": len(poses), "physics": "warp" if warp else "c"}
+    poses = {name: _poses(scene, step / 1e3, yaws) for name, scene in SCENES.items()}
+    counts = {name: len(grasps) for name, grasps in poses.items()}
+    result: dict[str, Any] = {"grasps": counts, "physics": "warp" if warp else "c"}
     hands: dict[str, dict[str, Any]] = {f"{force:g} N": {"down_force": force} for force in FORCES}
     hands["20 N, guarded"] = {"approach": "guarded"}
     for name, hand in hands.items():
