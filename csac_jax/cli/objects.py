@@ -35,8 +35,8 @@ class MakeOptions:
 
 @dataclasses.dataclass(frozen=True)
 class ImportOptions:
-    """Makes a library of mesh files (.obj, .stl, .ply, .glb), URDF or MJCF. Each is split into
-    convex parts, in seconds to a minute. Unusable files are named and left out."""
+    """Makes a library of mesh files (.obj, .stl, .ply, .glb), URDF or MJCF. Shapes that are not
+    convex are split, in seconds to a minute. Unusable files are named and left out."""
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Files, and folders of them."""
@@ -124,7 +124,7 @@ def _import(arguments: list[str]) -> int:
     shutil.rmtree(cache, ignore_errors=True)
     for member, share in converted:
         if not importing.SOUND[0] <= share <= importing.SOUND[1]:
-            print(f"{member.name}: its parts have {share:.2f} of the mesh's volume; check it")
+            print(f"{member.name}: its parts have {share:.2f} of its shapes' volume; check it")
     print(f"wrote {options.out}; {len(refused)} of {len(paths)} files left out")
     rows = [_row(member) | {"parts_volume": share} for member, share in converted]
     output.write_result(options.json, {"objects": rows, "refused": refused})

@@ -1,8 +1,9 @@
-"""A robot description, URDF or MJCF, as one closed mesh: MuJoCo reads it, trimesh joins its geoms.
+"""A robot description, URDF or MJCF, as one mesh of all its geoms, read by MuJoCo.
 
 It must be one rigid body: no joints but a free one.
 """
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ def read(path: Path) -> Any:
         raise ValueError(f"is larger than {_LARGEST >> 20} MiB; keep its meshes in files")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        _check_files(spec, path.parent.resolve())
+        spec.assets = _whole_files(spec, path.parent.resolve())
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(" ".join(str(error).split())[:200]) from None
@@ -39,17 +40,28 @@ def read(path: Path) -> Any:
     import trimesh
 
     meshes = [surface(model, geom).apply_transform(_pose(data, geom)) for geom in map(int, geoms)]
-    if len(meshes) == 1:
-        return meshes[0]
-    closed = all(mesh.is_volume for mesh in meshes)  # overlaps count once
-    return trimesh.boolean.union(meshes) if closed else trimesh.util.concatenate(meshes)
+    return trimesh.util.concatenate(meshes)
 
 
-def _check_files(spec: mujoco.MjSpec, folder: Path) -> None:
+def one_shape(content: bytes) -> bytes:
+    """Rewrites an OBJ file so that readers take it as one shape, corners told apart by position.
+
+    MuJoCo reads the first shape of several, with no warning.
+    """
+    plain = re.sub(rb"(?m)^[ \t]*(?:o|g|usemtl|mtllib|vn|vt)\b.*$", b"", content)
+    return re.sub(rb"/[-\d/]*", b"", plain)  # numbers of textures and normals
+
+
+def _whole_files(spec: mujoco.MjSpec, folder: Path) -> dict[str, bytes]:
+    """Returns the OBJ files that a description names, each as one shape."""
+    whole = {}
     for mesh in spec.meshes:
         file = (folder / spec.meshdir / mesh.file).resolve()
         if mesh.file and not file.is_relative_to(folder):
             raise ValueError(f"names '{mesh.file}', outside of its folder; move it there")
+        if file.suffix.lower() == ".obj" and file.is_file():
+            whole[mesh.file] = one_shape(file.read_bytes())
+    return whole
 
 
 def _pose(data: mujoco.MjData, geom: int) -> np.ndarray:

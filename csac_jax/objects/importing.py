@@ -12,17 +12,17 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from csac_jax.errors import SettingsError
-from csac_jax.objects import conversion, descriptions, library, solid
+from csac_jax.objects import conversion, descriptions, library
 from csac_jax.objects.body import Object
 from csac_jax.objects.conversion import ImportSettings
 from csac_jax.objects.library import LibraryError
 
 MESHES = (".obj", ".stl", ".ply", ".glb")
 MODULES = ("trimesh", "coacd")
-SOUND = (0.9, 1.15)  # volume of the parts / volume of the mesh; others deserve a look
+SOUND = (0.9, 1.15)  # volume of the parts / volume of all shapes; others deserve a look
 _MEMORY = 2**33  # bytes that one worker may ask for
 
-Converted = tuple[Object, float]  # with the volume of its parts / volume of the mesh
+Converted = tuple[Object, float]  # with the volume of its parts / of all shapes
 
 
 def files(paths: list[Path]) -> list[Path]:
@@ -125,6 +125,5 @@ def _cached(cache: Path, path: Path, name: str, settings: ImportSettings) -> Con
     with contextlib.suppress(LibraryError, OSError, ValueError):
         if cache.exists() and path.stat().st_size <= conversion.MOST_BYTES:
             (entry,) = library.load(_entry(cache, path, settings)).objects
-            share = sum(solid.moments(part).volume for part in entry.parts) / entry.volume
-            return dataclasses.replace(entry, name=name), share
+            return dataclasses.replace(entry, name=name), conversion.share(entry)
     return None
