@@ -89,6 +89,8 @@ class SimConfig(Section, section="sim"):
     """Pose of the arm's base: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
     adapter: float = number(0.0, 0.0, 0.3)  # Length between the arm's flange and the gripper, m.
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
+    opening: Literal["full", "fit"] = "fit"
+    """Fingers of a grasp on their way down: fully open, or about what the map shows there."""
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
     geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
     contacts: int = number(48, 1)  # Contacts that MJX and Warp keep per step.

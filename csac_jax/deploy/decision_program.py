@@ -74,15 +74,17 @@ def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool)
 
 def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, DenseMaps]:
     """Returns the best action in a state of height map [H, W] m, and the state without the cells
-    of this primitive within APART of it."""
+    of this primitive within APART of the hand, or between its fingers."""
     learner = actor_critic.make(cfg)
     best = policy.greedy(jax.random.key(0), learner, state, jnp.int32(0))
     pose = maps.denormalise(learner.frames, best.poses[best.primitive])
     action = Action(primitive=best.primitive, pose=pose)
     valid = maps.is_valid(learner.frames, state.valid, best.primitive, pose)
     choice = Choice(action, best.values[best.primitive], valid, stations(cfg, height, action))
-    offset = learner.frames.xy - pose[:2][None, None, None]
-    far = jnp.sum(offset**2, axis=-1) >= APART**2  # [K, h, w]
+    x, y, _, yaw, half = choice.stations[1]
+    offset = geometry.rotate2d(-yaw, learner.frames.xy - jnp.stack([x, y])[None, None, None])
+    reach = jnp.stack([jnp.maximum(half, APART), jnp.float32(APART)])  # along the closing, across
+    far = jnp.any(jnp.abs(offset) >= reach[None, None, None], axis=-1)  # [K, h, w]
     other = jnp.arange(len(Primitive)) != best.primitive
     return choice, state.replace(valid=state.valid & (far[None] | other[:, None, None, None]))
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import csac_jax
-from csac_jax import presets
+from csac_jax import grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
 from csac_jax.deploy import CameraPolicy, Decision, decision_program
 from csac_jax.errors import SettingsError, ViewError
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
 from tests.deploy import scenes
 
@@ -63,6 +65,20 @@ def test_decides_on_the_blocks(decisions: list[Decision]):
     assert decisions[0].score == max(decision.score for decision in decisions)
 
 
+def test_width_is_the_simulated_opening(policy: CameraPolicy):
+    """Claim: width and position of a decision among close neighbours are those that the simulated
+    hand comes down with, less than fully open."""
+    image = scenes.take(scenes.blocks_at([[0.0, y, 0.0] for y in (-0.08, 0.0, 0.08)]))
+    decided, height = policy.decide(*image, top=3), policy.observe(*image).height
+    for decision in decided:
+        chosen = Action.grasp(*decision.position[:2], decision.yaw)
+        plan = primitives.plan(policy.cfg.sim, policy.cfg.heightmap, height, chosen)
+        joints = primitives.joint_trajectory(policy.cfg.sim, plan).start
+        gap = grippers.load("rg2").gap(float(joints[4]))
+        assert decision.width == pytest.approx(gap, abs=1e-5)
+    assert min(decision.width for decision in decided) < 0.1
+
+
 def test_decides_as_in_simulation(decisions: list[Decision]):
     """Claim: the first decision is the simulated policy's in the observation of the same camera."""
     eye = camera.make(CameraConfig())
@@ -75,8 +91,10 @@ def test_decides_as_in_simulation(decisions: list[Decision]):
         hits = camera.cast_rays(eye, raycast.cast_polytopes, SHAPES)
         return observe.from_pixels(trained.cfg.heightmap, eye, hits, tables)
 
-    action = trained(observed(), jax.random.key(0))
-    np.testing.assert_allclose(decisions[0].position[:2], action.pose[:2], atol=1e-3)
+    obs = observed()
+    action = trained(obs, jax.random.key(0))
+    descended = decision_program.stations(trained.cfg, obs.height, action)[1]
+    np.testing.assert_allclose(decisions[0].position[:2], descended[:2], atol=1e-3)
     assert np.cos(2 * (decisions[0].yaw - float(action.pose[2]))) > 0.999
     assert decisions[0].primitive == "grasp"
 
