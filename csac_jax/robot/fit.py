@@ -69,5 +69,5 @@ def _highest(
     cells = jnp.floor(xy / cfg.cell + 0.5 * cfg.size).astype(jnp.int32)
     inside = jnp.all((cells >= 0) & (cells < cfg.size), axis=-1)
     col, row = jnp.moveaxis(jnp.clip(cells, 0, cfg.size - 1), -1, 0)
-    seen = height.at[row, col].get(mode="promise_in_bounds")
+    seen = jnp.asarray(height).at[row, col].get(mode="promise_in_bounds")
     return jnp.max(jnp.where(inside, seen, 0.0), axis=1)
