@@ -90,8 +90,8 @@ class SimConfig(Section, section="sim"):
     adapter: float = number(0.0, 0.0, 0.3)  # Length between the arm's flange and the gripper, m.
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
     opening: Literal["full", "fit"] = "fit"
-    """Fingers on the way down to a grasp: `full`, open where it was decided; `fit`, in the middle of
-    what the map shows between them, 10 mm beside it, at most open (ours: robot/fit.py)."""
+    """Fingers on the way down to a grasp: `full`, open at the place that was decided; `fit`, 10 mm
+    beside what the map shows between them, centred on it (ours: robot/fit.py)."""
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
     geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
     contacts: int = number(48, 1)  # Contacts that MJX and Warp keep per step.

@@ -30,11 +30,11 @@ def fit(
 
     What is higher than the tips at the middle is grasped, over gaps of a cell; where the middle is
     bare, all that is between the open tips. The hand moves to its middle and opens ROOM wider on
-    both sides, at most fully. Where nothing or what is wider than the hand lies, it opens fully in
-    place.
+    both sides, at most fully. Where nothing or what is wider than the hand lies, or where only the
+    fully open fingers come down on free ground, it opens fully in place.
     """
     most, step = 0.5 * jnp.asarray(fingers.opening, jnp.float32), 0.5 * cfg.cell
-    count = int(np.ceil(gripper.opening[1] / step))
+    count = int(np.ceil((gripper.opening[1] + gripper.finger[0]) / step))
     places = jnp.asarray((np.arange(-count, count) + 0.5) * step, jnp.float32)  # [S] m
     there = _highest(cfg, height, pose, places, gripper, fingers) > tip
     filled = there | jnp.roll(there, 1) | jnp.roll(there, -1)  # gaps of two samples are none
@@ -46,11 +46,15 @@ def fit(
         last = jnp.max(jnp.where(between, along, -most))
         return jnp.where(there[count - 1] | there[count], first - 1.5 * step, last + 0.5 * step)
 
+    def blocked(middle: Array | float, half: Array) -> Array:  # a finger comes down on something
+        beside = jnp.abs(places - middle)
+        return jnp.any(there & (beside > half) & (beside < half + fingers.thickness))
+
     back, ahead = end(-1.0), end(1.0)
-    half = 0.5 * (ahead + back)
-    fits = jnp.any(between) & (half < most)
+    shift, half = 0.5 * (ahead - back), 0.5 * (ahead + back)
     opened = jnp.clip(half + ROOM, gripper.half[0], most)
-    return Fit(jnp.where(fits, 0.5 * (ahead - back), 0.0), jnp.where(fits, opened, most))
+    fits = jnp.any(between) & (half < most) & (~blocked(shift, opened) | blocked(0.0, most))
+    return Fit(jnp.where(fits, shift, 0.0), jnp.where(fits, opened, most))
 
 
 def _highest(

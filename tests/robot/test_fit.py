@@ -47,7 +47,7 @@ def test_hand_moves_to_the_middle_of_a_cube(cfg: HeightmapConfig, side: float, y
     """Claim: over a cube off the middle, whatever its neighbours, the hand moves to its middle and
     opens ROOM wider on both sides, within half a cell; at most fully."""
     x = 0.014
-    height = _height(cfg, (x, 0.0, side, side), *_walls(x, 0.5 * side + 0.021))
+    height = _height(cfg, (x, 0.0, side, side), *_walls(x, 0.5 * side + 0.028))
     moved = _fit(cfg, height, 0.0, 0.0, yaw)
     assert moved.shift == pytest.approx(np.cos(yaw) * x, abs=0.5 * cfg.cell)
     assert moved.half == pytest.approx(min(0.5 * side + fit.ROOM, OPEN), abs=0.5 * cfg.cell)
@@ -57,15 +57,27 @@ def test_hand_moves_to_the_middle_of_a_cube(cfg: HeightmapConfig, side: float, y
 def test_cube_in_the_middle_counts(cfg: HeightmapConfig):
     """Claim: of two cubes between the fingers, the one in the middle is grasped; where the middle
     is bare, both are; a gap of a cell is none."""
-    cubes = [(x, 0.0, 0.028, 0.028) for x in (0.0, 0.042)]
+    cubes = [(x, 0.0, 0.028, 0.028) for x in (0.0, 0.056)]
     one = _fit(cfg, _height(cfg, *cubes))
     assert one.shift == pytest.approx(0.0, abs=0.5 * cfg.cell)
     assert one.half == pytest.approx(0.014 + fit.ROOM, abs=0.5 * cfg.cell)
-    both = _fit(cfg, _height(cfg, *cubes, *_walls(0.021, 0.06)), 0.021)
+    both = _fit(cfg, _height(cfg, *cubes, *_walls(0.028, 0.07)), 0.028, 0.0, 0.0)
     assert both.shift == pytest.approx(0.0, abs=0.5 * cfg.cell)
-    assert both.half == pytest.approx(0.035 + fit.ROOM, abs=0.5 * cfg.cell)
+    assert both.half == pytest.approx(0.042 + fit.ROOM, abs=0.5 * cfg.cell)
     bridged = _height(cfg, (0.0, 0.0, 0.028, 0.028), (0.028 + cfg.cell, 0.0, 0.028, 0.028))
     assert _fit(cfg, bridged).shift == pytest.approx(0.5 * (0.028 + cfg.cell), abs=0.5 * cfg.cell)
+
+
+@pytest.mark.parametrize("cfg", MAPS)
+def test_fingers_come_down_on_free_ground(cfg: HeightmapConfig):
+    """Claim: beside a neighbour on which a finger would come down, the hand opens fully in place
+    and encloses both; if those fingers would come down on another, it fits all the same."""
+    cube, near, far = (0.007, 0.0, 0.028, 0.1), (0.042, 0.0, 0.014, 0.1), (0.063, 0.0, 0.014, 0.1)
+    np.testing.assert_allclose(_fit(cfg, _height(cfg, cube, near)), [0.0, OPEN], rtol=1e-6)
+    wanted = 0.007, 0.014 + fit.ROOM
+    np.testing.assert_allclose(
+        _fit(cfg, _height(cfg, cube, near, far)), wanted, atol=0.5 * cfg.cell
+    )
 
 
 @pytest.mark.parametrize("gripper", ["rg2", "2f85", "franka_hand"])
