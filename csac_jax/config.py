@@ -89,7 +89,7 @@ class SimConfig(Section, section="sim"):
     """Pose of the arm's base: x, y and z, m, and its yaw, rad (ours: scenes/README.md)."""
     adapter: float = number(0.0, 0.0, 0.3)  # Length between the arm's flange and the gripper, m.
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
-    opening: Literal["full", "fit"] = "fit"
+    opening: Literal["full", "fit"] = "full"
     """Fingers on the way down to a grasp: `full`, open at the place that was decided; `fit`, 10 mm
     beside what the map shows between them, centred on it (ours: robot/fit.py)."""
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.

@@ -82,7 +82,9 @@ def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, De
     valid = maps.is_valid(learner.frames, state.valid, best.primitive, pose)
     choice = Choice(action, best.values[best.primitive], valid, stations(cfg, height, action))
     x, y, _, yaw, half = choice.stations[1]
-    offset = geometry.rotate2d(-yaw, learner.frames.xy - jnp.stack([x, y])[None, None, None])
+    offset = geometry.rotate2d(
+        -yaw, jnp.asarray(learner.frames.xy) - jnp.stack([x, y])[None, None, None]
+    )
     reach = jnp.stack([jnp.maximum(half, APART), jnp.float32(APART)])  # along the closing, across
     far = jnp.any(jnp.abs(offset) >= reach[None, None, None], axis=-1)  # [K, h, w]
     other = jnp.arange(len(Primitive)) != best.primitive

@@ -171,7 +171,7 @@ def test_exports_open_as_the_policy():
     from csac_jax.deploy import onnx
 
     cfg = presets.smoke().change(**SETTINGS["grasp"]).change(net={"growth": 4, "stem": 4})
-    cfg = cfg.change(policy={"place": "argmax"})
+    cfg = cfg.change(policy={"place": "argmax"}, sim={"opening": "fit"})
     params, obs = _random(cfg)
     x, _ = np.moveaxis(np.asarray(geometry.cell_centres(cfg.heightmap)), -1, 0)
     height = np.where(np.abs(np.sin(np.pi / 0.063 * x)) < 0.5, 0.05, 0.0).astype(np.float32)

@@ -69,6 +69,7 @@ def test_width_is_the_simulated_opening(policy: CameraPolicy):
     """Claim: width and position of a decision among close neighbours are those that the simulated
     hand comes down with, less than fully open."""
     image = scenes.take(scenes.blocks_at([[0.0, y, 0.0] for y in (-0.08, 0.0, 0.08)]))
+    policy = CameraPolicy(policy.cfg.change(sim={"opening": "fit"}), policy.params, WORKSPACE)
     decided, height = policy.decide(*image, top=3), policy.observe(*image).height
     for decision in decided:
         chosen = Action.grasp(*decision.position[:2], decision.yaw)
