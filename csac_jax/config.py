@@ -89,6 +89,9 @@ class SimConfig(Section, section="sim"):
     """Pose of the arm's base: x, y, z, m, and yaw, rad (ours: scenes/README.md; for own arms)."""
     adapter: float = number(0.0, 0.0, 0.3)  # Arm's flange to gripper, m (for own arms).
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
+    opening: Literal["full", "fit"] = "full"
+    """Fingers on the way down to a grasp: `full`, open at the place that was decided; `fit`, 10 mm
+    beside what the map shows between them, centred on it (ours: robot/fit.py)."""
     down_force: float = number(20.0, 0.0, 200.0, above=True)
     """Most force of the hand downwards, N; what resists more stops it (ours: a cautious arm)."""
     approach: Literal["free", "guarded"] = "free"

@@ -137,10 +137,11 @@ def test_pads_in_mujoco(fingers: Fingers):
 
 
 def _plan(fingers: Fingers | None) -> primitives.Plan:
-    """Of a grasp at a cube in the middle."""
+    """Of a grasp at a cube in the middle, fully open."""
     height = jnp.zeros((32, 32)).at[14:18, 14:18].set(0.05)
     grasp = Action.grasp(0.0, 0.0, 0.3)
-    return primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp, fingers)
+    sim = dataclasses.replace(CONFIG.sim, opening="full")
+    return primitives.plan(sim, CONFIG.heightmap, height, grasp, fingers)
 
 
 def test_hand_opens_as_far_as_the_fingers():

@@ -1,7 +1,8 @@
 """Antipodal grasps from the edges of a height map: a geometric baseline without networks.
 
 A grasp is good where the outermost edges between the fingers, higher than the tips will be, are
-square to the fingers, and both fingers come down on free ground.
+square to the fingers, and both fingers come down on free ground. With `sim.opening fit` the edges
+are those of what is at the middle, and the ground is that beside it.
 
 K = yaws over half a turn, S = cells along a side of the rotated maps, D = cells from the middle of
 the hand to the far side of a finger.
@@ -20,6 +21,7 @@ from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.grippers import Gripper
+from csac_jax.robot.fit import ROOM
 from csac_jax.robot.primitives import Action, grasp_depth, lowest, reachable
 from csac_jax.sim.outcome import BARE
 
@@ -89,7 +91,8 @@ def _scores(cfg: Config, gripper: Gripper, maps: Array, weights: Weights) -> Arr
     depth = grasp_depth(cfg.sim, gripper)
     tip = jnp.maximum(top - depth, lowest(cfg.sim, gripper))
     inner = int(gripper.half[1] / cell)
-    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4), inner)
+    fit = cfg.sim.opening == "fit"
+    hand = Hand(gripper, cell, reach, tip, jnp.maximum(top - tip, 1e-4), inner, fit)
     edges, filled, tilts, free = zip(*(_profile(hand, maps, way) for way in (1, -1)), strict=True)
     width = sum(edges)
     between = [_covered(hand, _shifted(maps, -2, row)) for row in range(-reach, reach + 1)]
@@ -111,6 +114,7 @@ class Hand(NamedTuple):
     tip: Array  # [K, S, S] m, how high the tips are
     below: Array  # [K, S, S] m, the same below the surface, above 0
     inner: int  # cells from the middle to an open finger
+    fit: bool  # it opens about what is at the middle
 
 
 def _covered(hand: Hand, maps: Array) -> Array:
@@ -129,19 +133,25 @@ def _profile(hand: Hand, maps: Array, way: int) -> tuple[Array, Array, Array, Ar
     under = gripper.half[1] + 0.5 * gripper.finger[0]  # m, middle of the finger
     rows = [_shifted(maps, -2, row) for row in (-hand.reach, hand.reach)]
     wide, edge = _window(maps, -2, hand.reach), jnp.zeros_like(maps)
+    gap, own = jnp.zeros_like(maps), jnp.ones(maps.shape, bool)
     filled = 0.5 * cell * _covered(hand, wide)
     ends = [0.5 * cell * _covered(hand, row) for row in rows]
     for number in range(1, hand.inner + 1):
         beyond = _shifted(wide, -1, way * number)
-        edge = jnp.where(beyond > hand.tip, (number + 0.5) * cell, edge)
-        filled += cell * _covered(hand, beyond)
+        if hand.fit:
+            own &= (beyond < hand.tip) | (gap < 1.5 * cell)  # a gap of a cell is none
+            gap = jnp.where(own, jnp.where(beyond < hand.tip, gap + cell, 0.0), gap)
+        edge = jnp.where(own & (beyond > hand.tip), (number + 0.5) * cell, edge)
+        filled += cell * _covered(hand, jnp.where(own, beyond, 0.0))
         ends = [
-            end + cell * _covered(hand, _shifted(row, -1, way * number))
+            end + cell * _covered(hand, jnp.where(own, _shifted(row, -1, way * number), 0.0))
             for end, row in zip(ends, rows, strict=True)
         ]
     free = jnp.ones(maps.shape, bool)
     for number in range(int((under - room) / cell), int((under + room) / cell) + 1):
         free &= _shifted(wide, -1, way * number) < hand.tip
+    if hand.fit:
+        free = (free & own) | (gap >= ROOM + gripper.finger[0])
     tilt = jnp.arctan2(jnp.abs(ends[1] - ends[0]), 2.0 * hand.reach * cell)
     return edge, filled, tilt, free
 

@@ -11,6 +11,7 @@ from csac_jax import grippers
 from csac_jax.config import Config, SlotKind
 from csac_jax.constants import Primitive
 from csac_jax.geometry import cell_centres, quat_to_matrix, rotate2d
+from csac_jax.robot.fit import ROOM
 from csac_jax.robot.primitives import Action, grasp_depth, local_top, lowest, reachable
 from csac_jax.world import blocks, object_slots, scene_state
 from csac_jax.world.scene_state import ANY, SceneState
@@ -115,7 +116,7 @@ def _candidates(
     """Scores grasps of targets, leaves [B, ...], at YAWS and `shifts`; n = B YAWS len(shifts)."""
     sim, gripper, cells = cfg.sim, grippers.load(cfg.sim.gripper), cell_centres(cfg.heightmap)
     fingers = scene_state.fingers(scene, gripper)
-    beside = 0.5 * fingers.opening + 0.5 * fingers.thickness  # m, to the middle of a finger
+    inner = 0.5 * jnp.asarray(fingers.opening)  # m, to an open finger
     along, across_pad = fingers.footprint
     slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
 
@@ -130,6 +131,10 @@ def _candidates(
         low, high = jnp.argmin(cosine), jnp.argmax(cosine)  # the faces most square to the pads
         width = target.offset[high] + target.offset[low]
         centre = place(target, yaw, shift)
+        beside = inner
+        if sim.opening == "fit":
+            beside = jnp.minimum(0.5 * width + ROOM, inner)
+        beside += 0.5 * fingers.thickness
         top = local_top(cfg.heightmap, height, centre, fingers.width)
         tip = jnp.maximum(top - grasp_depth(sim, gripper), lowest(sim, gripper))
         local = jnp.abs(rotate2d(-yaw, cells - centre[None, None]))

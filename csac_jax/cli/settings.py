@@ -29,7 +29,7 @@ FIRST = {
     "net": ("kind",),
 }
 """The settings that people change first: those of the short help."""
-_HAND = ("gripper", "base", "adapter", "clearance")
+_HAND = ("gripper", "base", "adapter", "clearance", "opening")
 VIEW: dict[str, tuple[str, ...]] = {"heightmap": (), "camera": (), "sensor": (), "sim": _HAND}
 """Sections of a policy's view and hand, () or some of their settings, for `eval` and `play`."""
 

@@ -25,7 +25,8 @@ LENGTH = "train."  # settings of a run's length and shape do not make another me
 MOST_CHANGES = 6  # a variant with more is named by its folder
 DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_temperature": 0.0}
 """Settings that `eval` can change, and their values in configs that lack them."""
-VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance")  # likewise
+VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance", "sim.opening")
+"""Likewise."""
 
 Json = dict[str, Any]
 

@@ -11,7 +11,7 @@ from csac_jax import geometry, grippers
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.grippers import Fingers, Gripper
-from csac_jax.robot import kinematics
+from csac_jax.robot import fit, kinematics
 
 BLOCK = 0.05  # m, height of a common block
 START_GAP = 0.01  # m, between the open hand's tips and what lies under them at the start
@@ -74,9 +74,10 @@ def plan(
 ) -> Plan:
     """Plans the set-points of a primitive, one of VPG's two (arXiv:1803.09956).
 
-    Grasp: straight down with open fingers to `grasp_depth` below the surface, close, lift. Push:
-    down with closed fingers to `push_depth`, then `push_length` along the yaw, or to the border of
-    the workspace, then lift. `fingers` default to the gripper's.
+    Grasp: straight down to `grasp_depth` below the surface, close, lift. With `sim.opening fit` it
+    moves and opens as `fit.fit` finds, else fully. Push: down with closed fingers to `push_depth`,
+    then `push_length` along the yaw, or to the border of the workspace, then lift. `fingers`
+    default to the gripper's.
     """
     is_grasp = action.primitive == Primitive.GRASP
     xy, yaw = action.pose[:2], action.pose[2]
@@ -87,16 +88,21 @@ def plan(
     low = jnp.maximum(surface - depth, lowest(cfg, gripper))
     around = local_top(heightmap, height, xy, 2.0 * gripper.radius)
     high = jnp.maximum(low + cfg.approach_height, around + START_GAP)
-    end = jnp.where(is_grasp, xy, _push_end(cfg, heightmap, xy, yaw))
-    closed = gripper.half[0]
-    opening = jnp.where(is_grasp, 0.5 * fingers.opening, closed)
+    closed, opening = gripper.half[0], 0.5 * jnp.asarray(fingers.opening)
+    start = xy
+    if cfg.opening == "fit":
+        shift, opening = fit.fit(heightmap, height, action.pose, low, gripper, fingers)
+        moved = xy + shift * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+        start = jnp.where(is_grasp, moved, xy)
+    opening = jnp.where(is_grasp, opening, closed)
+    end = jnp.where(is_grasp, start, _push_end(cfg, heightmap, xy, yaw))
     phases = jnp.where(is_grasp, _progress(cfg, cfg.grasp_phases), _progress(cfg, cfg.push_phases))
     descend, act, lift = phases  # [T] each
     z = high + (low - high) * descend + (high - low) * lift
-    place = xy[None] + act[:, None] * (end - xy)[None]
+    place = start[None] + act[:, None] * (end - start)[None]
     half = closed + (opening - closed) * (1.0 - jnp.minimum(1.3 * act, 1.0))  # before the lift
     control = jnp.column_stack([place, z, jnp.full_like(z, yaw), half])
-    return Plan(control=control, start=jnp.hstack([xy, high, yaw, opening]), surface=surface)
+    return Plan(control=control, start=jnp.hstack([start, high, yaw, opening]), surface=surface)
 
 
 def reachable(

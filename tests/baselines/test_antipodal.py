@@ -19,7 +19,7 @@ CFG = Config()
 PLACES = np.asarray(cell_centres(CFG.heightmap))  # [H, W, 2] m
 STEP = np.pi / antipodal.YAWS  # rad, between two yaws that are tried
 
-_choose = jax.jit(functools.partial(antipodal.grasp, cfg=CFG, weights=Weights()))
+_choose = jax.jit(functools.partial(antipodal.grasp, weights=Weights()), static_argnames="cfg")
 
 
 def _inside(x: float, y: float, yaw: float, half: tuple[float, float]) -> np.ndarray:
@@ -30,10 +30,13 @@ def _inside(x: float, y: float, yaw: float, half: tuple[float, float]) -> np.nda
     return (np.abs(along) <= half[0]) & (np.abs(across) <= half[1])
 
 
-def _grasp(height: np.ndarray, failures: int = 0, wanted: np.ndarray | None = None) -> Action:
+def _grasp(
+    height: np.ndarray, failures: int = 0, wanted: np.ndarray | None = None, cfg: Config = CFG
+) -> Action:
     here = np.ones(height.shape, bool) if wanted is None else wanted
     maps = jnp.asarray(height, jnp.float32), jnp.asarray(here)
-    return _choose(jax.random.key(0), height=maps[0], wanted=maps[1], failures=jnp.int32(failures))
+    seen = {"height": maps[0], "wanted": maps[1], "failures": jnp.int32(failures)}
+    return _choose(jax.random.key(0), cfg=cfg, **seen)
 
 
 @pytest.mark.parametrize("yaw", np.linspace(0.0, 2.8, 5))
@@ -52,13 +55,16 @@ def _cell(action: Action) -> tuple[int, int]:
     return int(row), int(col)
 
 
-def test_fingers_come_down_on_free_ground():
-    """Claim: where a wall stands along a part of a bar, the bar is taken where there is none."""
+@pytest.mark.parametrize(("opening", "far"), [("full", 0.067), ("fit", 0.048)])
+def test_fingers_come_down_on_free_ground(opening: str, far: float):
+    """Claim: where a wall stands along a part of a bar, the bar is taken where there is none: where
+    the open fingers would come down, or closer than a finger needs to one that opens about it."""
+    cfg = CFG.change(sim={"opening": opening})
     bar = _inside(0.0, 0.0, 0.0, (0.10, 0.02))
-    wall = _inside(-0.03, 0.067, 0.0, (0.10, 0.006))
+    wall = _inside(-0.03, far, 0.0, (0.10, 0.006))
     only = bar & (PLACES[..., 0] > -0.1)
-    assert _grasp(0.05 * bar, wanted=only).pose[0] < 0.05
-    assert _grasp(0.05 * (bar | wall), wanted=only).pose[0] > 0.06
+    assert _grasp(0.05 * bar, wanted=only, cfg=cfg).pose[0] < 0.05
+    assert _grasp(0.05 * (bar | wall), wanted=only, cfg=cfg).pose[0] > 0.06
 
 
 def test_what_is_too_wide_is_left():

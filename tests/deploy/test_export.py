@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from csac_jax import cli, presets
+from csac_jax import cli, geometry, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import Config
 from csac_jax.deploy import CameraPolicy, decision, stablehlo
@@ -164,6 +164,28 @@ def test_onnx_of_other_nets(name: str):
         assert bool(results[3]) == can_act
         if can_act:
             _assert_close(results, cfg, params, *maps, scale=scale)
+
+
+def test_exports_open_as_the_policy():
+    """Claim: both formats move and open a grasp between close neighbours as the policy does."""
+    from csac_jax.deploy import onnx
+
+    cfg = presets.smoke().change(**SETTINGS["grasp"]).change(net={"growth": 4, "stem": 4})
+    cfg = cfg.change(policy={"place": "argmax"}, sim={"opening": "fit"})
+    params, obs = _random(cfg)
+    x, _ = np.moveaxis(np.asarray(geometry.cell_centres(cfg.heightmap)), -1, 0)
+    height = np.where(np.abs(np.sin(np.pi / 0.063 * x)) < 0.5, 0.05, 0.0).astype(np.float32)
+    maps = obs.colour, height
+    program = jax.export.deserialize(
+        bytearray(stablehlo.serialize(*stablehlo.from_maps(cfg, params)))
+    )
+    session = onnxruntime.InferenceSession(onnx.serialize(cfg, params))
+    for results in (
+        program.call(*maps),
+        session.run(None, dict(zip(onnx.INPUTS, maps, strict=False))),
+    ):
+        assert 0.02 < 2.0 * results[4][1, 4] < 0.1
+        _assert_close(results, cfg, params, *maps, scale=1.0)
 
 
 def test_policy_files(policy: CameraPolicy, tmp_path: Path):

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import csac_jax
-from csac_jax import presets
+from csac_jax import grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
 from csac_jax.deploy import CameraPolicy, Decision, decision as decisions_of
 from csac_jax.errors import SettingsError, ViewError
+from csac_jax.robot import primitives
+from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
 from tests.deploy import scenes
 
@@ -55,11 +57,26 @@ def test_decides_on_the_blocks(decisions: list[Decision]):
     assert None not in map(_block_under, decisions)
     for decision in decisions:
         assert decision.position[2] == pytest.approx(0.05 - 0.035, abs=1e-3)
-        assert decision.width == pytest.approx(0.11)
+        assert 0.05 <= decision.width <= 0.11 + 1e-6  # the block's, or fully open
     places = np.array([decision.position[:2] for decision in decisions])
     apart = np.linalg.norm(places[:, None] - places[None], axis=-1)[np.triu_indices(4, 1)]
     assert apart.min() >= decisions_of.APART - 1e-6
     assert decisions[0].score == max(decision.score for decision in decisions)
+
+
+def test_width_is_the_simulated_opening(policy: CameraPolicy):
+    """Claim: width and position of a decision among close neighbours are those that the simulated
+    hand comes down with, less than fully open."""
+    image = scenes.take(scenes.blocks_at([[0.0, y, 0.0] for y in (-0.08, 0.0, 0.08)]))
+    policy = CameraPolicy(policy.cfg.change(sim={"opening": "fit"}), policy.params, WORKSPACE)
+    decided, height = policy.decide(*image, top=3), policy.observe(*image).height
+    for decision in decided:
+        chosen = Action.grasp(*decision.position[:2], decision.yaw)
+        plan = primitives.plan(policy.cfg.sim, policy.cfg.heightmap, height, chosen)
+        joints = primitives.joint_trajectory(policy.cfg.sim, plan).start
+        gap = grippers.load("rg2").gap(float(joints[4]))
+        assert decision.width == pytest.approx(gap, abs=1e-5)
+    assert min(decision.width for decision in decided) < 0.1
 
 
 def test_decides_as_in_simulation(decisions: list[Decision]):
@@ -74,8 +91,10 @@ def test_decides_as_in_simulation(decisions: list[Decision]):
         hits = camera.cast_rays(eye, raycast.cast_polytopes, SHAPES)
         return observe.from_pixels(trained.cfg.heightmap, eye, hits, tables)
 
-    action = trained(observed(), jax.random.key(0))
-    np.testing.assert_allclose(decisions[0].position[:2], action.pose[:2], atol=1e-3)
+    obs = observed()
+    action = trained(obs, jax.random.key(0))
+    descended = decision_program.stations(trained.cfg, obs.height, action)[1]
+    np.testing.assert_allclose(decisions[0].position[:2], descended[:2], atol=1e-3)
     assert np.cos(2 * (decisions[0].yaw - float(action.pose[2]))) > 0.999
     assert decisions[0].primitive == "grasp"
 
@@ -101,7 +120,8 @@ def test_waypoints_are_a_grasp(decisions: list[Decision]):
     low = decisions[0].position[2]
     heights = [place[2] for place in places]
     np.testing.assert_allclose(heights, [low + 0.1, low, low, low + 0.1], atol=1e-5)
-    np.testing.assert_allclose(openings, [0.11, 0.11, 0.0, 0.0], atol=1e-6)
+    width = decisions[0].width
+    np.testing.assert_allclose(openings, [width, width, 0.0, 0.0], atol=1e-6)
     for waypoint in decisions[0].waypoints:
         tool, (x, y, z) = np.array(waypoint.tool), waypoint.position
         np.testing.assert_allclose(tool[:3, 3], [0.4 - y, -0.2 + x, 0.05 + z], atol=1e-6)

@@ -11,7 +11,7 @@ from csac_jax.geometry import cell_centres
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action, Plan
 
-SIM = SimConfig()
+SIM = SimConfig(opening="full")
 RG2 = grippers.load("rg2")
 MAP = HeightmapConfig(size=224)  # 2 mm cells
 X, Y, Z, YAW, FINGERS = range(5)

@@ -1,0 +1,77 @@
+"""The opening of a grasp: as wide as what the map shows between the fingers.
+
+S = samples along the closing, half a cell apart; the middle of the hand lies between two of them.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from csac_jax import geometry
+from csac_jax.config import HeightmapConfig
+from csac_jax.grippers import Fingers, Gripper
+
+ROOM = 0.01  # m (ours), between what is grasped and each open finger
+
+
+class Fit(NamedTuple):
+    """How the hand opens over a place."""
+
+    shift: Array  # [] m, of its middle along the closing
+    half: Array  # [] m, half the opening
+
+
+def fit(
+    cfg: HeightmapConfig, height: Array, pose: Array, tip: Array, gripper: Gripper, fingers: Fingers
+) -> Fit:
+    """Fits a grasp at `pose` [3] m, m, rad to a map `height` [H, W] m, with tips at `tip` [] m.
+
+    What is higher than the tips at the middle is grasped, over gaps of a cell; where the middle is
+    bare, all that is between the open tips. The hand moves to its middle and opens ROOM wider on
+    both sides, at most fully. Where nothing or what is wider than the hand lies, or where only the
+    fully open fingers come down on free ground, it opens fully in place.
+    """
+    most, step = 0.5 * jnp.asarray(fingers.opening, jnp.float32), 0.5 * cfg.cell
+    count = int(np.ceil((gripper.opening[1] + gripper.finger[0]) / step))
+    places = jnp.asarray((np.arange(-count, count) + 0.5) * step, jnp.float32)  # [S] m
+    there = _highest(cfg, height, pose, places, gripper, fingers) > tip
+    filled = there | jnp.roll(there, 1) | jnp.roll(there, -1)  # gaps of two samples are none
+    between = there & (jnp.abs(places) < most)
+
+    def end(way: float) -> Array:  # [] m, how far it reaches
+        along = way * places
+        first = jnp.min(jnp.where(filled | (along < 0.0), places[-1] + step, along))
+        last = jnp.max(jnp.where(between, along, -most))
+        return jnp.where(there[count - 1] | there[count], first - 1.5 * step, last + 0.5 * step)
+
+    def blocked(middle: Array | float, half: Array) -> Array:  # a finger comes down on something
+        beside = jnp.abs(places - middle)
+        return jnp.any(there & (beside > half) & (beside < half + fingers.thickness))
+
+    back, ahead = end(-1.0), end(1.0)
+    shift, half = 0.5 * (ahead - back), 0.5 * (ahead + back)
+    opened = jnp.clip(half + ROOM, gripper.half[0], most)
+    fits = jnp.any(between) & (half < most) & (~blocked(shift, opened) | blocked(0.0, most))
+    return Fit(jnp.where(fits, shift, 0.0), jnp.where(fits, opened, most))
+
+
+def _highest(
+    cfg: HeightmapConfig,
+    height: Array,
+    pose: Array,
+    places: Array,
+    gripper: Gripper,
+    fingers: Fingers,
+) -> Array:
+    """Returns the highest surface [S] m under a finger's width at `places` [S] m."""
+    rows = int(np.ceil(2.0 * gripper.finger[1] / cfg.cell)) + 1
+    across = jnp.asarray(fingers.width, jnp.float32) * np.linspace(-0.5, 0.5, rows, dtype="f4")
+    strip = jnp.stack(jnp.meshgrid(places, across, indexing="ij"), axis=-1)  # [S, rows, 2]
+    xy = geometry.rotate2d(pose[2], strip) + pose[:2][None, None]
+    cells = jnp.floor(xy / cfg.cell + 0.5 * cfg.size).astype(jnp.int32)
+    inside = jnp.all((cells >= 0) & (cells < cfg.size), axis=-1)
+    col, row = jnp.moveaxis(jnp.clip(cells, 0, cfg.size - 1), -1, 0)
+    seen = jnp.asarray(height).at[row, col].get(mode="promise_in_bounds")
+    return jnp.max(jnp.where(inside, seen, 0.0), axis=1)
