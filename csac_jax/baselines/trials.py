@@ -40,7 +40,7 @@ def simulate(
 
     Callers vmap over scenes: all actions of all scenes are one batch of the engine.
     """
-    return jax.vmap(functools.partial(_trial, cfg, physics, scene, height))(actions)
+    return jax.vmap(functools.partial(trial, cfg, physics, scene, height))(actions)
 
 
 def height_map(cfg: Config, scene: SceneState) -> Array:
@@ -48,9 +48,10 @@ def height_map(cfg: Config, scene: SceneState) -> Array:
     return observe.observe(cfg, scene).height
 
 
-def _trial(
+def trial(
     cfg: Config, physics: Physics, scene: SceneState, height: Array, action: Action
 ) -> Trials:
+    """Simulates one action; returns leaves without the axis [K]."""
     after, trace, plan = simulation.execute(physics, cfg, scene, height, action)
     sound = simulation.healthy(after)
     after = jax.tree.map(functools.partial(jnp.where, sound), after, scene)
