@@ -41,41 +41,35 @@ def make_physics(cfg: Config) -> Physics:
 
 
 def plan(
-    key: Array, cfg: Config, physics: Physics, scene: SceneState, height: Array, budget: Budget
-) -> Action:
-    """Plans an action from random candidates, see `choose`; `height` [H, W] m as the robot sees."""
-    key_grasps, key_pushes, key_choose = jax.random.split(key, 3)
-    grasps = sample_grasps(key_grasps, scene, budget.grasps)
-    pushes = sample_pushes(key_pushes, cfg, scene, budget.pushes)
-    return choose(key_choose, cfg, physics, scene, height, grasps, pushes, budget.grasps_after)
-
-
-def choose(
     key: Array,
     cfg: Config,
     physics: Physics,
     scene: SceneState,
     height: Array,
-    grasps: Action,
-    pushes: Action,
-    grasps_after: int,
+    budget: Budget,
+    proposed: tuple[Action, Action] | None = None,
 ) -> Action:
-    """Chooses among grasps, leaves [K, ...], and pushes [M, ...] by simulation.
+    """Plans an action over the map `height` [H, W] m that the robot sees.
 
     The best grasp lifts the most wanted blocks and loses none, then grips firmest. If none lifts
-    one, the best push is that after which the most of `grasps_after` random grasps do. Of equal
-    ones it moves least; if no grasp would lift, most.
+    one, the best push loses none and is followed by the most random grasps that lift. Of equal ones
+    it moves least, but most if no grasp would lift. Grasps and pushes, leaves [K, ...] and
+    [M, ...], are random unless `proposed`.
     """
+    key_grasps, key_pushes, key_after = jax.random.split(key, 3)
+    grasps, pushes = proposed or (
+        sample_grasps(key_grasps, scene, budget.grasps),
+        sample_pushes(key_pushes, cfg, scene, budget.pushes),
+    )
     tried = trials.simulate(cfg, physics, scene, height, grasps)
-    score = _grasp_scores(tried)
-    grasp = jax.tree.map(lambda leaf: leaf[jnp.argmax(score)], grasps)
+    grasp = jax.tree.map(lambda leaf: leaf[jnp.argmax(_grasp_scores(tried))], grasps)
     if not pushes.primitive.size:
         return grasp
 
     def push() -> Action:
         pushed = trials.simulate(cfg, physics, scene, height, pushes)
-        counts = lifting_after(key, cfg, physics, pushed, grasps_after)
-        best = jnp.argmax(_push_scores(pushed, counts, scene))
+        counts = lifting_after(key_after, cfg, physics, pushed, budget.grasps_after)
+        best = jnp.argmax(_push_scores(pushed, counts))
         return jax.tree.map(lambda leaf: leaf[best], pushes)
 
     return jax.lax.cond(jnp.any(tried.wanted), lambda: grasp, push)
@@ -138,13 +132,9 @@ def lifting_after(
 def _grasp_scores(tried: Trials) -> Array:
     wanted, lost = jnp.sum(tried.wanted, axis=1), jnp.sum(tried.lost, axis=1)
     grip = jnp.max(jnp.where(tried.wanted, tried.grip, 0.0), axis=1)  # at most 1
-    lifts = wanted > 0
-    return 100.0 * lifts + 2.0 * (wanted - 2 * lost).astype(jnp.float32) + grip
+    return 100.0 * (wanted > 0) + 2.0 * (wanted - 2 * lost).astype(jnp.float32) + grip
 
 
-def _push_scores(pushed: Trials, counts: Array, scene: SceneState) -> Array:
-    lost = jnp.any(pushed.lost, axis=1)
-    target_lost = jnp.any(pushed.lost & scene_state.is_target(scene)[None], axis=1)
-    lost = jnp.where(scene.target == scene_state.ANY, lost, lost | target_lost)
-    preference = jnp.where(jnp.any(counts > 0), -1.0, 1.0) * jnp.tanh(pushed.motion)
-    return counts.astype(jnp.float32) + 0.5 * preference - 1e3 * lost
+def _push_scores(pushed: Trials, counts: Array) -> Array:
+    preference = jnp.where(jnp.any(counts > 0), -0.5, 0.5) * jnp.tanh(pushed.motion)
+    return counts.astype(jnp.float32) + preference - 1e3 * jnp.any(pushed.lost, axis=1)

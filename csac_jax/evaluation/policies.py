@@ -176,11 +176,8 @@ class PlannerPolicy:
 def _planned(policy: PlannerPolicy, state: State, key: jax.Array) -> Action:
     cfg, physics = policy.cfg, planner.make_physics(policy.cfg)
     scene = scene_state.park(state.scene, ~state.done & state.scene.in_play)
-    if policy.proposer is None:
-        return planner.plan(key, cfg, physics, scene, state.obs.height, policy.budget)
-    actions = policy.proposer.proposals(state, PROPOSALS)
-    grasps_after = policy.budget.grasps_after
-    return planner.choose(key, cfg, physics, scene, state.obs.height, *actions, grasps_after)
+    proposed = policy.proposer.proposals(state, PROPOSALS) if policy.proposer else None
+    return planner.plan(key, cfg, physics, scene, state.obs.height, policy.budget, proposed)
 
 
 def _alone(tree: Any) -> Any:

@@ -110,11 +110,11 @@ def test_planner_pushes_towards_a_grasp():
 
     @jax.jit
     def chosen(key: jax.Array):
-        num, height = FEW.grasps_after, state.obs.height
-        pushed = trials.simulate(TARGET, physics, state.scene, height, pushes)
-        counts = planner.lifting_after(key, TARGET, physics, pushed, num)
-        rest = TARGET, physics, state.scene, height, grasps, pushes, num
-        return planner.choose(jax.random.clone(key), *rest), counts, pushed
+        rest = TARGET, physics, state.scene, state.obs.height
+        pushed = trials.simulate(*rest, pushes)
+        last = jax.random.split(jax.random.clone(key), 3)[2]
+        counts = planner.lifting_after(last, TARGET, physics, pushed, FEW.grasps_after)
+        return planner.plan(key, *rest, FEW, (grasps, pushes)), counts, pushed
 
     action, counts, pushed = chosen(jax.random.key(2))
     assert action.primitive == Primitive.PUSH
