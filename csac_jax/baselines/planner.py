@@ -29,9 +29,9 @@ NEAR = 0.12  # m from the target's centre, within which blocks are pushed (ours)
 class Budget:
     """Numbers of simulated actions of a decision, measured (ours). No pushes: one deep."""
 
-    grasps: int = struct.field(pytree_node=False, default=64)
-    pushes: int = struct.field(pytree_node=False, default=24)
-    grasps_after: int = struct.field(pytree_node=False, default=16)  # each push
+    grasps: int = struct.field(pytree_node=False, default=48)
+    pushes: int = struct.field(pytree_node=False, default=16)
+    grasps_after: int = struct.field(pytree_node=False, default=12)  # each push
 
 
 @functools.lru_cache(maxsize=4)

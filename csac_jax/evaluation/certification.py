@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +17,7 @@ from csac_jax.baselines import planner, trials
 from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
+from csac_jax.runtime import provenance
 from csac_jax.scenes.certify import Certificate
 from csac_jax.world import scene_state
 from csac_jax.world.scene_state import SceneState
@@ -62,7 +62,7 @@ def settings(cfg: Config) -> str:
     world = planner.make_physics(cfg).world.digest
     search = (GRID, YAWS, MOST_BEFORE, LEAST_AFTER, PUSHES, GRASPS_AFTER, TASTE)
     view = (cfg.heightmap.size, cfg.heightmap.extent, cfg.heightmap.view)
-    return repr((_VERSION, mujoco.__version__, world, view, search))
+    return repr((_VERSION, provenance.versions().get("mujoco"), world, view, search))
 
 
 def judge(lab: Lab, scene: SceneState, generator: str, seed: int) -> Certificate:
