@@ -26,7 +26,7 @@ Map, in the direction of data; imports point only backwards along it:
     nets        dense Q maps and action proposals
     agent       learner: cross-entropy method, targets, losses, rewards, exploration, update
     replay      ring of transitions and its samplers
-    baselines   an oracle, antipodal grasps
+    baselines   an oracle, antipodal grasps, a planner that simulates
     env         reset and step of one scene
     io          checkpoints, policy files, configs
     training    the training step and its host loop

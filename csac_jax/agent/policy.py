@@ -4,12 +4,15 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from csac_jax.agent import actor, cem, explore, maps
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps, Frames
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
+
+DISTINCT = 0.02, 0.7  # m and rad; a proposal that is nearer to a better one, in both, is none
 
 
 def greedy(
@@ -95,6 +98,23 @@ def best_action(
     """Returns the greedy action, without exploration."""
     best = greedy(key, learner, state, steps_without_change)
     return Action(best.primitive, maps.denormalise(learner.frames, best.poses[best.primitive]))
+
+
+def proposals(learner: ActorCritic, state: DenseMaps, primitive: Primitive, num: int) -> Action:
+    """Returns the best distinct cells of a primitive as actions, leaves [num, ...], best first."""
+    frames = learner.frames
+    xy, yaws = jnp.asarray(frames.xy), jnp.asarray(frames.yaws)[:, None, None]
+
+    def propose(values: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
+        pose = maps.cell_pose(frames, jnp.argmax(values).astype(jnp.int32))
+        near = jnp.linalg.norm(xy - pose[:2], axis=-1) < DISTINCT[0]
+        turn = jnp.cos(yaws - pose[2])
+        turn = jnp.abs(turn) if primitive == Primitive.GRASP else turn  # the hand is symmetric
+        return jnp.where(near & (turn > np.cos(DISTINCT[1])), -jnp.inf, values), pose
+
+    values = jnp.where(state.valid[primitive], state.q[primitive], -jnp.inf)
+    _, poses = jax.lax.scan(propose, values, length=num)
+    return Action(jnp.full(num, primitive, jnp.int32), poses)
 
 
 def after_failures(

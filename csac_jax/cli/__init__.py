@@ -27,6 +27,7 @@ from csac_jax.cli import (
     parsing,
     play,
     report,
+    scenes,
     serve,
     sweep,
     train,
@@ -51,6 +52,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "report": report.run,
     "export": export.run,
     "objects": objects.run,
+    "scenes": scenes.run,
     "doctor": doctor.run,
     "bench": bench.run,
 }
@@ -73,6 +75,7 @@ A robot learns to push and grasp in clutter.
   report RUN...      tables and figures of recorded runs and evaluations
   export DIR FILE    write the policy of a run into one small file
   objects COMMAND    make, import or show a library of objects
+  scenes certify     keep scenes in which a push must come before a grasp
   doctor             versions, devices and a self-test of this machine
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 

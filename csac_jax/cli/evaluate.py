@@ -33,7 +33,8 @@ class EvalOptions:
     """Checkpoint of the run: last, best (of a run trained with --eval-every), or a step."""
     policy: str = "learned"
     """Actor: learned, the networks; random, above blocks; geometric, antipodal grasps from the
-    height map; oracle, a planner that reads the blocks' poses; or MODULE:NAME, your own."""
+    height map; oracle, which reads the blocks' poses; planner, which simulates many actions;
+    learned+planner, which simulates those of the networks; or MODULE:NAME, your own."""
     suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
     """Scenes: in_distribution (like the training's), random10, random30, cases, packed, camera
     (ever worse ones), target (of that task); pile, objects_packed, objects10, target_objects (of a
@@ -134,7 +135,7 @@ def _measure(
     episodes: int,
 ) -> dict[str, Any]:
     """Measures the policy in a suite; returns the metrics with all that they follow from."""
-    from csac_jax.evaluation import rollout, suites
+    from csac_jax.evaluation import policies, rollout, suites
     from csac_jax.io import configs
     from csac_jax.runtime import cache, provenance
 
@@ -144,7 +145,7 @@ def _measure(
     has_objects = suite in suites.SUITES and suites.SUITES[suite].objects
     objects = options.objects if has_objects or options.out is None else None
     world = (options.seed, options.physics, options.robot, objects, options.split)
-    prepared = suites.prepare(cfg, suite, episodes, *world, options.policy == "learned")
+    prepared = suites.prepare(cfg, suite, episodes, *world, policies.is_learned(policy))
     table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
     asked = {"policy": options.policy, "which": options.which, "seed": options.seed}
     library = {"objects": prepared.cfg.scene.objects, "split": options.split}
@@ -191,9 +192,9 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 
 
 def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
-    from csac_jax.evaluation import suites
+    from csac_jax.evaluation import policies, suites
 
-    targets = {cfg.task.kind == "target"} if options.policy == "learned" else {False, True}
+    targets = {cfg.task.kind == "target"} if options.policy in policies.LEARNED else {False, True}
     has_library = bool(options.objects or cfg.scene.objects)
     return tuple(
         name

@@ -26,7 +26,8 @@ class PlayOptions:
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
-    """Policy: oracle (reads the blocks' poses), random, a shipped one, a run or a policy file."""
+    """Policy: oracle (reads the blocks' poses), planner (simulates many actions), random, a shipped
+    one, a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
@@ -100,8 +101,9 @@ def _policy(source: str) -> Any:
     """Returns the policy; one without networks has the config of `quick`."""
     from csac_jax.evaluation import policies
 
-    kinds = {"oracle": policies.OraclePolicy, "random": policies.RandomPolicy}
-    return kinds[source](presets.quick()) if source in kinds else policies.load(source)
+    if source in ("oracle", "planner", "random"):
+        return policies.BASELINES[source](presets.quick())
+    return policies.load(source)
 
 
 def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any, list[Any]]:

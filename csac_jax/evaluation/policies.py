@@ -14,8 +14,9 @@ from flax import struct
 from csac_jax import geometry
 from csac_jax.agent import actor_critic, maps, policy, values
 from csac_jax.agent.learner import Learner
-from csac_jax.baselines import antipodal, oracle
+from csac_jax.baselines import antipodal, oracle, planner
 from csac_jax.config import Config
+from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
@@ -23,7 +24,9 @@ from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
 from csac_jax.training import programs
 from csac_jax.vision.heightmap import Observation
+from csac_jax.world import scene_state
 
+PROPOSALS = 8  # grasps, and as many pushes, that networks propose to the planner (ours)
 Which = int | Literal["last", "best"]  # checkpoint of a run, see `load`
 
 
@@ -67,6 +70,16 @@ class NetworkPolicy:
         retried = jax.vmap(policy.after_failures, (0, None, 0, 0))
         dense_maps = retried(keys, parts, dense_maps, failed)
         return jax.vmap(policy.best_action, (0, None, 0, 0))(keys, parts, dense_maps, unchanged)
+
+    def proposals(self, scene: Observation | State, num: int) -> tuple[Action, Action]:
+        """Returns the best distinct grasps and pushes, leaves [num, ...] each."""
+        parts = actor_critic.make(self.cfg, self.network)
+        dense_maps = _first(values.decision_maps(parts, self.params, _alone(_seen(scene)[0])))
+        grasps, pushes = (
+            policy.proposals(parts, dense_maps, kind, num)
+            for kind in (Primitive.GRASP, Primitive.PUSH)
+        )
+        return grasps, pushes
 
     @jax.jit
     def debug(self, scene: Observation | State, key: jax.Array) -> PolicyDebug:
@@ -139,6 +152,34 @@ class GeometricPolicy:
         return antipodal.grasp(key, self.cfg, obs.height, obs.target, failures, self.weights)
 
 
+@struct.dataclass
+class PlannerPolicy:
+    """A planner that reads the scene's state and simulates its choices, see `baselines.planner`.
+
+    Networks, if there are any, propose the actions; else they are random. `cfg` must be the
+    environment's. Under vmap, scenes are planned one after the other: each has a batch of its own.
+    """
+
+    cfg: Config = struct.field(pytree_node=False)
+    proposer: NetworkPolicy | None = None
+    budget: planner.Budget = planner.Budget()
+
+    @jax.jit
+    def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
+        """Chooses an action. Raises TypeError for an observation."""
+        if not isinstance(scene, State):
+            raise TypeError("the planner simulates the scene: give it a State, no Observation")
+        return _planned(self, scene, key)
+
+
+@jax.custom_batching.sequential_vmap
+def _planned(policy: PlannerPolicy, state: State, key: jax.Array) -> Action:
+    cfg, physics = policy.cfg, planner.make_physics(policy.cfg)
+    scene = scene_state.park(state.scene, ~state.done & state.scene.in_play)
+    proposed = policy.proposer.proposals(state, PROPOSALS) if policy.proposer else None
+    return planner.plan(key, cfg, physics, scene, state.obs.height, policy.budget, proposed)
+
+
 def _alone(tree: Any) -> Any:
     """Makes a batch of one, leaves [1, ...]."""
     return jax.tree.map(lambda leaf: leaf[None], tree)
@@ -162,9 +203,20 @@ def _without_lift(scene: State) -> jax.Array:
     return (scene.actions > 0) & (scene.info.cleared == 0)
 
 
+def is_learned(policy: Policy) -> bool:
+    """Returns whether networks act or propose, which must know a suite's task."""
+    if isinstance(policy, PlannerPolicy):
+        return policy.proposer is not None
+    return isinstance(policy, NetworkPolicy)
+
+
 def in_world(policy: Policy, cfg: Config) -> Policy:
     """Gives a policy the config of an environment; a custom policy stays as it is."""
-    ours = NetworkPolicy | CustomLearnerPolicy | RandomPolicy | GeometricPolicy | OraclePolicy
+    if isinstance(policy, PlannerPolicy) and policy.proposer is not None:
+        proposer = policy.proposer.replace(cfg=cfg)
+        return policy.replace(cfg=cfg, proposer=proposer)
+    baselines = RandomPolicy | GeometricPolicy | OraclePolicy | PlannerPolicy
+    ours = NetworkPolicy | CustomLearnerPolicy | baselines
     return dataclasses.replace(policy, cfg=cfg) if isinstance(policy, ours) else policy
 
 
@@ -212,13 +264,15 @@ def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
 
 
 def make(kind: str, source: str | Path, which: Which = "last") -> Policy:
-    """Makes the policy of a kind: `learned`, the networks of `source`, see `load`; or a name of
-    `BASELINES` or `MODULE:NAME`, a callable that takes the config of `source`. Raises SettingsError
-    for an unknown kind."""
-    if kind == "learned":
-        return load(source, which=which)
+    """Makes the policy of a kind: `learned`, the networks of `source`, see `load`;
+    `learned+planner`, which has physics choose among what they propose; or a name of `BASELINES` or
+    `MODULE:NAME`, a callable that takes the config of `source`. Raises SettingsError for an unknown
+    kind."""
+    if kind in LEARNED:
+        learned: Any = load(source, which=which)
+        return learned if kind == "learned" else PlannerPolicy(learned.cfg, learned)
     if kind not in BASELINES and ":" not in kind:
-        known = ", ".join(("learned", *BASELINES))
+        known = ", ".join((*LEARNED, *BASELINES))
         raise SettingsError(f"policy: '{kind}' is neither MODULE:NAME nor one of: {known}")
     build = BASELINES[kind] if kind in BASELINES else _imported(kind)
     return build(load_config(source, which))
@@ -235,9 +289,12 @@ def _imported(path: str) -> Callable[[Config], Policy]:
         raise SettingsError(f"policy: '{path}' cannot be imported ({error})") from None
 
 
+LEARNED = ("learned", "learned+planner")
+"""Kinds with the networks of a source."""
 BASELINES: dict[str, Callable[[Config], Policy]] = {
     "random": RandomPolicy,
     "geometric": GeometricPolicy,
     "oracle": OraclePolicy,
+    "planner": PlannerPolicy,
 }
 """Policies without networks, each made from the config that it acts in."""

@@ -47,7 +47,7 @@ def evaluate(
     a suite with several parts {"parts": {name: metrics}}. Raises SettingsError as `suites.prepare`.
     """
     if not isinstance(suite, suites.PreparedSuite):
-        learned = isinstance(policy, NetworkPolicy)
+        learned = policies.is_learned(policy)
         suite = suites.prepare(
             policy.cfg, suite, episodes, seed, physics, robot, objects, split, learned
         )
