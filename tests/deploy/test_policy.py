@@ -93,7 +93,7 @@ def test_decides_as_in_simulation(decisions: list[Decision]):
 
     obs = observed()
     action = trained(obs, jax.random.key(0))
-    descended = decision_program.stations(trained.cfg, obs.height, action)[1]
+    descended = decisions_of.stations(trained.cfg, obs.height, action)[1]
     np.testing.assert_allclose(decisions[0].position[:2], descended[:2], atol=1e-3)
     assert np.cos(2 * (decisions[0].yaw - float(action.pose[2]))) > 0.999
     assert decisions[0].primitive == "grasp"
