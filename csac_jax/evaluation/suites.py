@@ -71,7 +71,7 @@ MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
 ACTIONS_EACH = 5  # most actions for each object (ours): pushes do not count as failures
 TIGHT = (0.6, 0.95)  # middle side of an object of `tight` over the hand's opening
 HIDDEN = {"kind": "target", "max_actions": 10}  # ours: a search takes longer
-SEEN = {"seen_50_100": (0.5, 1.0), "seen_1_50": (0.0, 0.5), "seen_0": (-1.0, 0.0)}  # above, to
+SEEN = {"seen_50_100": (0.5, 1.0), "seen_1_50": (0.01, 0.5), "seen_0": (-1.0, 0.0)}  # above, to
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
 
 # Config of the policy, episodes, stream of random numbers -> parts by name, or the only one.

@@ -22,7 +22,7 @@ SUITES: dict[str, SceneConfig] = {
     "blocked": SceneConfig(slots=("box",) * 9 + ("arch",) * 3, min_blocks=1),
     "enclosed": SceneConfig(slots=("box",) * 9 + ("cylinder",), min_blocks=1),
     "tray": SceneConfig(slots=("box",) * 5 + ("arch",), min_blocks=1, tray=TRAY),
-    "hidden": SceneConfig(slots=("box",) * 5, min_blocks=1),
+    "hidden": SceneConfig(slots=("box",) * 6, min_blocks=1),
 }
 """Slots of the scenes of each suite; those that a scene has no use for are parked."""
 WITH_TARGET = ("enclosed", "hidden")  # suites whose scenes mark a target
@@ -277,30 +277,35 @@ def _seen(draw: _Draw) -> float:
 
 
 def _roof(draw: _Draw) -> list[Piece]:
-    """Puts a block between two rails and a plate over the three."""
+    """Puts a block between two rails with a bar behind, and a plate over them."""
     long, high, share = draw.long(), draw(0.028, 0.040), _seen(draw)
-    (x, y), rails = draw.many(2, 0.045, 0.052), draw.many(2, 0.036, 0.045)
+    (x, y), rails, bar = draw.many(2, 0.042, 0.048), draw.many(2, 0.036, 0.038), draw(0.036, 0.045)
     deep = 0.0 if share else draw(0.005, 0.05)  # the target lies so far under the plate
     pieces = [Piece((0.5 * x + deep, 0.0), (x, y, high))]
     for way, rail in zip((-0.5, 0.5), rails, strict=True):
         pieces.append(Piece((0.5 * long, way * (y + rail)), (long, rail, high)))
+    behind = long + 0.5 * bar, 0.5 * (rails[1] - rails[0])
+    pieces.append(Piece(behind, (bar, y + sum(rails), high)))  # else a pressed plate would tip
     plate = draw.long(), draw.long(), draw(0.012, 0.020)
     return [*pieces, Piece((share * x + 0.5 * plate[0], 0.0), plate, floor=high)]
 
 
-def _planks(draw: _Draw) -> list[Piece]:
-    """Puts a block between two sleepers and two planks side by side along them."""
-    x, y, high, share = draw(0.044, 0.050), draw(0.050, 0.058), draw(0.028, 0.040), _seen(draw)
-    sleepers, long, thick = draw.many(2, 0.039, 0.042), draw.long(), draw(0.014, 0.022)
-    deep = 0.0 if share else draw(0.005, 0.05)
-    pieces = [Piece((0.0, 0.5 * y + deep), (x, y, high))]
-    for way, wide in zip((-0.5, 0.5), sleepers, strict=True):
-        pieces.append(Piece((way * (x + wide), 0.5 * long), (wide, long, high)))
-    for way, wide in zip((-0.5, 0.5), sleepers, strict=True):
-        plank = (0.5 * x + wide, draw.long(), thick)
-        middle = way * plank[0], share * y + 0.5 * plank[1]
-        pieces.append(Piece(middle, plank, floor=high, exact=True))
-    return pieces
+def _shed(draw: _Draw) -> list[Piece]:
+    """Puts a block and a filler between rails, and a plate that leaves one side of them open."""
+    (x, y), high, share = draw.many(2, 0.042, 0.050), draw(0.028, 0.040), _seen(draw)
+    rail, wide, last, long = draw(0.034, 0.040), draw(0.062, 0.068), draw(0.042, 0.048), draw.long()
+    filler = long - x - draw(0.022, 0.026)  # a finger has room between block and filler
+    inner = y + draw(0.0, 0.006)
+    plate = long + draw(-0.004, 0.004), draw.long(), draw(0.014, 0.022)
+    start = share * y if share else draw(-0.015, -0.005)
+    return [
+        Piece((0.5 * x, 0.5 * y), (x, y, high)),
+        Piece((long - 0.5 * filler, 0.5 * inner), (filler, inner, high)),
+        Piece((0.5 * long, -0.5 * rail), (long, rail, high)),
+        Piece((0.5 * long, inner + 0.5 * wide), (long, wide, high)),
+        Piece((0.5 * long, inner + wide + 0.5 * last), (long, last, high)),
+        Piece((0.5 * long, start + 0.5 * plate[1]), plate, floor=high, exact=True),
+    ]
 
 
 def _vault(draw: _Draw) -> list[Piece]:
@@ -342,7 +347,7 @@ TEST = _constructions(
     rings=("enclosed", _rings),
     shelf=("tray", _shelf),
     nook=("tray", _nook),
-    planks=("hidden", _planks),
+    shed=("hidden", _shed),
     vault=("hidden", _vault),
 )
 """Constructions of the suites, by name; no policy is trained on them."""
