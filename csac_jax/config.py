@@ -18,6 +18,7 @@ PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 Pair = tuple[float, float]
+TRAY_WALL: Pair = (0.01, 0.05)  # m, thickness and height of a tray's walls (ours)
 
 
 class SceneConfig(Section, section="scene"):
@@ -30,6 +31,8 @@ class SceneConfig(Section, section="scene"):
     """Library for slots of kind object: a folder, or procedural[+assemblies]:SEED:COUNT."""
     split: Literal["train", "held_out", "all"] = "train"
     """Objects of the library: those for training, those kept for evaluation, or all (for eval)."""
+    middle_side: Pair = number((0.0, 1.0), 0.0, 1.0)
+    """Range of the middle side of the objects that are drawn, m; their bounding box has three."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
@@ -39,18 +42,24 @@ class SceneConfig(Section, section="scene"):
     friction: Pair = number((0.5, 1.0), 0.1, 2.0)  # Range of sliding friction, blocks and table.
     drop_extent: Pair = number((0.248, 0.248), 0.05, 0.448)  # Side of a dropped pile, m (VPG).
     settle_time: float = number(2.5, 0.5, 20.0)  # Time for blocks to come to rest, s (ours).
+    tray: float = number(0.0, 0.0, 1.0)  # Inner side of a square tray with walls, m; 0: no tray.
 
     def check(self) -> None:
         most = len(self.slots)
         require(most >= 1, "scene.slots: at least one block slot is needed")
         require(self.min_blocks <= most, f"scene.min_blocks: at most the {most} scene.slots")
-        for name in ("density", "friction", "drop_extent"):
+        for name in ("density", "friction", "drop_extent", "middle_side"):
             low, high = getattr(self, name)
             require(low <= high, f"scene.{name}: low <= high is needed")
         if self.has_objects:
             require(self.objects != "", "scene.objects: slots of kind object need a library")
             alike = set(self.slots) == {"object"} or self.packed_fraction == 0.0
             require(alike, "scene.packed_fraction: must be 0 where slots hold objects and blocks")
+        if self.tray:
+            widest = self.drop_extent[1]
+            require(self.tray >= widest, f"scene.tray: at least scene.drop_extent, {widest:g} m")
+            alike = self.packed_fraction == 0.0 or self.has_objects
+            require(alike, "scene.packed_fraction: must be 0 for blocks in a scene.tray")
 
     @property
     def has_objects(self) -> bool:
@@ -474,8 +483,15 @@ class Config(Section):
         most = 2 * math.floor(0.5 * math.pi * size)
         fits = rotations % 2 == 0 and rotations <= most
         require(fits, f"net.rotations: must be even, at most {most} for heightmap.size {size}")
+        self._check_tray()
         fits = not self.scene.has_objects or self.sim.physics != "mjx"
         require(fits, "sim.physics: objects that differ between scenes need c, warp or auto")
         scaled = self.scene.size_jitter[1] != 0.0 and set(MESH_KINDS) & set(self.scene.slots)
         fits = self.sim.physics != "warp" or not scaled
         require(fits, "scene.size_jitter: the second must be 0 where sim.physics is warp")
+
+    def _check_tray(self) -> None:
+        outside, extent = self.scene.tray + 2.0 * TRAY_WALL[0], self.heightmap.extent
+        fits = not self.scene.tray or outside <= extent
+        walls = f"with its walls {outside:g} m, does not fit into heightmap.extent, {extent:g} m"
+        require(fits, f"scene.tray: {walls}")

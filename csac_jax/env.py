@@ -199,7 +199,8 @@ class Env:
         is_grasp = action.primitive == Primitive.GRASP
         hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
         lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~undone
-        inside = scene_state.inside(after.position, self.cfg.heightmap.extent)
+        side = self.cfg.scene.tray or self.cfg.heightmap.extent  # over a wall, too, is lost
+        inside = scene_state.inside(after.position, side)
         lost = after.in_play & ~inside & ~lifted
         after = scene_state.park(after, ~lifted & ~lost)
         judged = plan.surface, is_grasp, hand_rise, diverged, blocked, lifted, lost
@@ -233,9 +234,11 @@ class Env:
         )
 
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
-        """Rotates a scene at random; draws the target, and fingers and grip where they vary."""
+        """Rotates a scene at random, in a tray by quarter turns; draws the target, and fingers and
+        grip where they vary."""
         extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        placed = scene_state.randomise_pose(key, scene, extent, self.any_yaw, has_target)
+        any_yaw = self.any_yaw and not self.cfg.scene.tray
+        placed = scene_state.randomise_pose(key, scene, extent, any_yaw, has_target)
         placed = scene_state.with_grip(jax.random.fold_in(key, _GRIP), placed, self.cfg.sim)
         return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
 

@@ -22,8 +22,9 @@ from csac_jax.nets import dense
 from csac_jax.nets.networks import Networks
 from csac_jax.robot import primitives
 from csac_jax.sim.outcome import BARE
-from csac_jax.vision import rotate
+from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation
+from csac_jax.world import tray
 
 
 def allowed_primitives(cfg: PolicyConfig) -> tuple[Primitive, ...]:
@@ -44,8 +45,9 @@ class Frames:
     push_length: float  # m
     shows_target: bool  # the target task: the net sees the target's mask
     all_cells: bool  # actions may begin on bare table
+    walls: np.ndarray  # [H, W] m, height of the tray's walls; 0 elsewhere
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
-    inside: np.ndarray  # [K, h, w] bool, above the workspace
+    inside: np.ndarray  # [K, h, w] bool, above the workspace, or above the tray's floor
     reachable: np.ndarray  # [P, K, h, w] bool, the robot reaches both ends of the action
 
 
@@ -66,10 +68,19 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         push_length=cfg.sim.push_length,
         shows_target=cfg.task.kind == "target",
         all_cells=cfg.policy.action_mask == "none",
+        walls=_walls(cfg),
         xy=xy,
-        inside=np.all(np.abs(xy) <= 0.5 * extent, axis=-1),
+        inside=np.all(np.abs(xy) <= 0.5 * (cfg.scene.tray or extent), axis=-1),
         reachable=_reachable(sim, cfg.heightmap, rotations, side, cell),
     )
+
+
+def _walls(cfg: Config) -> np.ndarray:
+    with jax.ensure_compile_time_eval():
+        xy = np.asarray(geometry.cell_centres(cfg.heightmap))
+    # A point that a camera at the side sees lies anywhere in its cell.
+    margin = 0.5 * cfg.heightmap.cell if cfg.heightmap.view == "oblique" else 0.0
+    return tray.heights(cfg.scene.tray, xy, margin)
 
 
 def _cells(rotations: int, side: int, cell: float) -> tuple[np.ndarray, np.ndarray]:
@@ -140,19 +151,28 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     """Returns cells where an action can have an effect, [P, K, h, w] bool; SPOT, arXiv:1909.11730.
 
     Grasp: a surface above BARE under the cell, in the target task the target's. Push: one within
-    its length ahead. With `policy.action_mask` none, every cell that the robot reaches.
+    its length ahead. While nothing of a target is seen, any surface may be grasped. A tray's walls
+    are none. With `policy.action_mask` none, every cell that the robot reaches.
     """
     allowed = frames.inside[None] & frames.reachable
     if frames.all_cells:
         return jnp.asarray(allowed)
-    graspable = under = cell_heights(frames, obs.height) > BARE
-    if frames.shows_target:
-        graspable = cell_heights(frames, jnp.where(obs.target, obs.height, 0.0)) > BARE
+    under, graspable = (cell_heights(frames, top) > BARE for top in surfaces(frames, obs))
     reach = int(np.ceil(frames.push_length / frames.cell))
     ahead = jax.lax.reduce_window(
         under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
     )
     return jnp.stack([ahead, graspable]) & allowed
+
+
+def surfaces(frames: Frames, obs: Observation) -> tuple[jax.Array, jax.Array]:
+    """Returns the surfaces to push and to grasp, each [H, W] m; 0 where there is none."""
+    walls, height = frames.walls, obs.height
+    if walls.any():
+        height = jnp.where((walls > 0.0) & (height <= walls + BARE), 0.0, height)
+    if not frames.shows_target:
+        return height, height
+    return height, jnp.where(heightmap.wanted(obs.target), height, 0.0)
 
 
 def cell_heights(frames: Frames, height: jax.Array) -> jax.Array:

@@ -53,7 +53,8 @@ def grasp(
     places = _places(cfg, yaws)  # [K, S, S, 2] m
     maps = _sampled(cfg, height, places)
     score = _scores(cfg, grippers.load(cfg.sim.gripper), maps, weights)
-    inside = (np.abs(places) < 0.5 * cfg.heightmap.extent).all(axis=-1)
+    side = cfg.scene.tray or cfg.heightmap.extent
+    inside = (np.abs(places) < 0.5 * side).all(axis=-1)
     there = _sampled(cfg, wanted.astype(jnp.float32), places) > 0.5
     noise = weights.noise * failures.astype(jnp.float32)
     score += noise * jax.random.uniform(key, score.shape)

@@ -37,8 +37,9 @@ class EvalOptions:
     learned+planner, which simulates those of the networks; or MODULE:NAME, your own."""
     suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
     """Scenes: in_distribution (like the training's), random10, random30, cases, packed, camera
-    (ever worse ones), target (of that task); pile, objects_packed, objects10, target_objects (of a
-    library); case files; or all that fit the policy."""
+    (ever worse ones), blocked, tray; target, enclosed, hidden (of that task); pile, tight,
+    objects_packed, objects10, target_objects (of a library); case files, or folders of them; or all
+    that fit the policy."""
     out: Path | None = None
     """Folder for a file of each suite and a table of all; finished suites are not repeated."""
     jobs: int = 0

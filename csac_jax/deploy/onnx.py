@@ -75,8 +75,8 @@ def _actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
     allowed = jnp.asarray(frames.inside[None] & frames.reachable)
     if frames.all_cells:
         return allowed
-    height = jnp.where(obs.target, obs.height, 0.0) if frames.shows_target else obs.height
-    under, graspable = (maps.cell_heights(frames, top) > BARE for top in (obs.height, height))
+    tops = maps.surfaces(frames, obs)
+    under, graspable = (maps.cell_heights(frames, top) > BARE for top in tops)
     reach = int(np.ceil(frames.push_length / frames.cell))
     padded = jnp.pad(under, ((0, 0), (1, 1), (0, reach)))
     rows = padded[:, :-2] | padded[:, 1:-1] | padded[:, 2:]

@@ -23,6 +23,7 @@ from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
 from csac_jax.training import programs
+from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
 
@@ -149,7 +150,8 @@ class GeometricPolicy:
         obs, failures, _ = _seen(scene)
         if isinstance(scene, State):  # it may have moved without being lifted
             failures = jnp.maximum(failures, jnp.int32(_without_lift(scene)))
-        return antipodal.grasp(key, self.cfg, obs.height, obs.target, failures, self.weights)
+        wanted = heightmap.wanted(obs.target)
+        return antipodal.grasp(key, self.cfg, obs.height, wanted, failures, self.weights)
 
 
 @struct.dataclass

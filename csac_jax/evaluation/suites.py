@@ -13,7 +13,14 @@
 `objects_packed`   five, upright side by side.
 `objects10`        ten, dropped as in random10.
 `target_objects`   one marked object among ten, to get within 5 actions.
-a path             the user's case file.
+`blocked`          blocks side by side, of which no grasp lifts one before a push.
+`enclosed`         one marked block that others enclose, to get within 5 actions.
+`tray`             blocks along the walls and in the corners of a tray.
+`tight`            piles of objects whose middle side is 0.6 to 0.95 of the opening, for hands that
+                   open by 110 and 80 mm.
+`hidden`           one marked block to get within 10 actions; from above 50 to 100 %, 1 to 50 % and
+                   nothing of it is seen.
+a path             the user's case file, or a folder of them, one part each.
 
 Suites of objects draw from the library of `scene.objects`; docs/benchmark.md defines them.
 Training draws from stream 0 of random numbers, a suite from stream 1 + seed. Dropped and drawn
@@ -22,6 +29,7 @@ quarters where another turn would take a block out of the workspace.
 """
 
 import dataclasses
+import functools
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +38,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from csac_jax import env as environment
+from csac_jax import env as environment, grippers
 from csac_jax.config import (
     Config,
     PhysicsKind,
@@ -45,8 +53,9 @@ from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
 from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
-from csac_jax.scenes import arrange, cases, pool
+from csac_jax.scenes import arrange, cases, constructions, pool
 from csac_jax.sim import backend, physics as simulation
+from csac_jax.vision import observe
 from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 
@@ -60,6 +69,9 @@ TARGET = {"kind": "target", "max_actions": 5}  # CSAC sec. 4.4
 FEW = 5  # objects of `pile` and `objects_packed` (VGN, arXiv:2101.01132)
 MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
 ACTIONS_EACH = 5  # most actions for each object (ours): pushes do not count as failures
+TIGHT = (0.6, 0.95)  # middle side of an object of `tight` over the hand's opening
+HIDDEN = {"kind": "target", "max_actions": 10}  # ours: a search takes longer
+SEEN = {"seen_50_100": (0.5, 1.0), "seen_1_50": (0.01, 0.5), "seen_0": (-1.0, 0.0)}  # above, to
 PACKED: tuple[SlotKind, ...] = ("box",) * 6 + ("arch",) * 2 + ("prism",) * 2 + ("cylinder",) * 2
 
 # Config of the policy, episodes, stream of random numbers -> parts by name, or the only one.
@@ -110,10 +122,10 @@ def prepare(
 ) -> PreparedSuite:
     """Builds the environments of a suite for policies of a config; settles their scenes.
 
-    Args: suite, a name of `SUITES` or a case file; episodes, of every part; objects and split, the
-    library of suites of objects, by default the config's; learned, False for a policy that needs no
-    training. Raises SettingsError for a suite that is unknown, damaged or does not fit the policy,
-    and for a library that is missing or not needed.
+    Args: suite, a name of `SUITES`, a case file or a folder of them; episodes, of every part;
+    objects and split, the library of suites of objects, by default the config's; learned, False for
+    a policy that needs no training. Raises SettingsError for a suite that is unknown, damaged or
+    does not fit the policy, and for a library that is missing or not needed.
     """
     check(suite)
     suite = RENAMED_SUITES.get(suite, suite)
@@ -121,7 +133,7 @@ def prepare(
     few = cfg.change(sim={"physics": physics, "robot": robot}, train={"scenes": 1})
     cfg = cfg.change(sim=backend.resolve(few).sim)  # `auto`: what suits a few scenes at a time
     if suite not in SUITES:
-        parts: Any = {Path(suite).stem: _case(cfg, Path(suite))}
+        parts: Any = {path.stem: _case(cfg, path) for path in _case_files(Path(suite))}
     elif SUITES[suite].target and learned and cfg.task.kind != "target":
         raise SettingsError(
             f"suite: {suite} needs a policy trained with task.kind target, this one was trained to "
@@ -134,10 +146,18 @@ def prepare(
 
 
 def check(suite: str) -> None:
-    """Raises SettingsError for a name that is neither a suite's nor a file's."""
-    if RENAMED_SUITES.get(suite, suite) not in SUITES and not Path(suite).is_file():
+    """Raises SettingsError for a name that is neither a suite's, nor a file's, nor a folder's."""
+    if RENAMED_SUITES.get(suite, suite) in SUITES:
+        return
+    if not Path(suite).exists():
         known = ", ".join(SUITES)
         raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
+    if not _case_files(Path(suite)):
+        raise SettingsError(f"suite: {suite} holds no case file, NAME.json")
+
+
+def _case_files(path: Path) -> list[Path]:
+    return sorted(path.glob("*.json")) if path.is_dir() else [path]
 
 
 def _with_objects(cfg: Config, suite: str, objects: str | None, split: Split) -> Config:
@@ -244,7 +264,53 @@ def _objects10(cfg: Config, episodes: int, stream: int) -> Env:
 
 
 def _as_target(env: Env) -> Env:
-    return dataclasses.replace(env, cfg=env.cfg.change(task=TARGET))
+    return _with_task(env, TARGET)
+
+
+def _constructed(suite: str, episodes: int, stream: int) -> SceneState:
+    """Draws scenes of the constructions that test a suite, in turn; leaves [P, N, ...]."""
+    key = jax.random.key(stream)
+    makes = [one.make for one in constructions.TEST.values() if one.suite == suite]
+    keys = [jax.random.fold_in(key, number) for number in range(episodes)]
+    scenes = [makes[number % len(makes)](key) for number, key in enumerate(keys)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *scenes)
+
+
+def _pushes(suite: str, cfg: Config, episodes: int, stream: int) -> Env:
+    """Builds a suite whose scenes need pushes; 2.5 actions for each block or more, as dropped."""
+    scene = constructions.SUITES[suite]
+    actions = max(cfg.task.max_actions, len(scene.slots) * 5 // 2)
+    cfg = _wide(cfg, scene).change(task={"max_actions": actions})
+    return _env(cfg, _constructed(suite, episodes, stream), MAX_FAILURES)
+
+
+def _with_task(env: Env, task: dict[str, Any]) -> Env:
+    return dataclasses.replace(env, cfg=env.cfg.change(task=task))
+
+
+def _hidden(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
+    """Builds a part for each range of what is seen of the target; the scenes of one draw."""
+    env = _with_task(_pushes("hidden", cfg, len(SEEN) * episodes, stream), HIDDEN)
+    share = functools.partial(observe.seen_share, env.cfg.scene)
+    shares = np.asarray(jax.jit(functools.partial(jax.lax.map, share))(env.scenes))
+    return {
+        name: dataclasses.replace(
+            env, scenes=jax.tree.map(lambda leaf, rows=rows: leaf[rows], env.scenes)
+        )
+        for name, (low, high) in SEEN.items()
+        if (rows := (shares > low) & (shares <= high)).any()
+    }
+
+
+def _tight(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
+    """Builds piles of objects that hardly fit the hand, for two hands."""
+    parts = {}
+    for gripper in ("rg2", "franka_hand"):
+        opening = grippers.load(gripper).opening[1]
+        sides = (TIGHT[0] * opening, TIGHT[1] * opening)
+        fitting = cfg.change(scene={"middle_side": sides}, sim={"gripper": gripper})
+        parts[f"{1e3 * opening:.0f}_mm"] = _pile(fitting, episodes, stream)
+    return parts
 
 
 def _camera(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
@@ -277,3 +343,8 @@ register("pile", _pile, 1000, objects=True)
 register("objects_packed", _objects_packed, 1000, objects=True)
 register("objects10", _objects10, 500, objects=True)
 register("target_objects", lambda *of: _as_target(_objects10(*of)), 500, target=True, objects=True)
+register("blocked", functools.partial(_pushes, "blocked"))
+register("enclosed", lambda *of: _as_target(_pushes("enclosed", *of)), target=True)
+register("tray", functools.partial(_pushes, "tray"))
+register("tight", _tight, 500, objects=True)
+register("hidden", _hidden, target=True)

@@ -32,6 +32,8 @@ from csac_jax.world.scene_state import SceneState
 
 TRAIN_STREAM = 0  # evaluation takes others
 _VERSION = 5  # raise when the meaning of a cached pool changes
+# Settings that are younger than the shipped pools, at their defaults.
+_LATER = (", middle_side=(0.0, 1.0)", ", tray=0.0")
 _SPACING = 0.13  # m between the centres of blocks as they are dropped: none touch
 _ROUND = 128  # scenes dropped per round
 _MOST_DROPPED = 12  # blocks that drop all at once: of 20, hardly any stay in the workspace
@@ -232,8 +234,7 @@ def pour(world: World, cfg: Config, scene: SceneState, fields: BlockFields) -> S
             data.qvel[world.block_dofs[pinned]] = 0.0
             mujoco.mj_step(data.model, data, nstep=_PIN_EVERY)
         quiet += _PAUSE
-        radius = np.linalg.norm(data.qpos[world.block_qpos[:, :2]], axis=1)
-        outside = ~pinned & (radius > 0.5 * cfg.heightmap.extent)
+        outside = ~pinned & ~_inside(cfg, data.qpos[world.block_qpos[:, :2]])
         waiting += [int(slot) for slot in np.flatnonzero(outside)]
         pinned |= outside
         if not waiting and quiet >= cfg.scene.settle_time:
@@ -245,7 +246,7 @@ def _rested(world: World, cfg: Config, scene: SceneState, data: mujoco.MjData) -
     pose = data.qpos[world.block_qpos].astype(np.float32)
     position, quaternion = pose[:, :3], pose[:, 3:]
     speed = np.abs(data.qvel[world.block_dofs]) * [1, 1, 1, 0.03, 0.03, 0.03]
-    ok = np.hypot(position[:, 0], position[:, 1]) <= 0.5 * cfg.heightmap.extent
+    ok = _inside(cfg, position[:, :2])
     ok &= (speed.max(axis=1) < scene_state.STILL) & (position[:, 2] > 0.0)
     ok &= np.isfinite(pose).all(axis=1)
     if not np.all(ok | ~scene.in_play):
@@ -253,6 +254,13 @@ def _rested(world: World, cfg: Config, scene: SceneState, data: mujoco.MjData) -
     in_play, upright = scene.in_play[:, None], np.array([1, 0, 0, 0], np.float32)
     position = np.where(in_play, position, scene.position)
     return scene.replace(position=position, quaternion=np.where(in_play, quaternion, upright))
+
+
+def _inside(cfg: Config, xy: np.ndarray) -> np.ndarray:
+    """Tests which places [N, 2] m lie in the tray, or in the workspace at any yaw; [N] bool."""
+    if cfg.scene.tray:
+        return np.abs(xy).max(axis=1) <= 0.5 * cfg.scene.tray
+    return np.hypot(xy[:, 0], xy[:, 1]) <= 0.5 * cfg.heightmap.extent
 
 
 def shipped() -> Path:
@@ -266,7 +274,10 @@ def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=object_slots.library(scene).sha256)
-    settings = repr((_VERSION, mujoco.__version__, repr(scene), *numbers, *how))
+    described = repr(scene)
+    for later in _LATER:
+        described = described.replace(later, "")
+    settings = repr((_VERSION, mujoco.__version__, described, *numbers, *how))
     content = hashlib.sha256(settings.encode())
     code = [arrange.__file__, packings.__file__] if "arranged" in how else []
     for path in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml", *code):

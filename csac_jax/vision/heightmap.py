@@ -19,7 +19,8 @@ class Observation:
 
     colour: jax.Array  # [H, W, 3] float32, 0 .. 1
     height: jax.Array  # [H, W] float32, m above the table
-    target: jax.Array  # [H, W] bool, a wanted block is seen; all True if any block is wanted
+    # [H, W] bool, a wanted block is seen; all True if any is wanted, all False if it is hidden
+    target: jax.Array
     fingers: jax.Array | None = None  # [3] float32 m, `grippers.Fingers`; None where unseen
 
 
@@ -71,6 +72,11 @@ def observation(
     """
     shown = jnp.where(cells.filled[..., None], colour, 0.0)
     return Observation(shown, cells.height, jnp.where(cells.filled, target, elsewhere))
+
+
+def wanted(target: jax.Array) -> jax.Array:
+    """Returns where to grasp for a target's mask [H, W] bool: everywhere while none is seen."""
+    return target | ~jnp.any(target)
 
 
 def pack(obs: Observation) -> PackedObservation:

@@ -18,7 +18,7 @@ from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.vision.raycast import ObjectShapes, Polytopes, SurfaceHit
-from csac_jax.world import blocks, object_slots, scene_state
+from csac_jax.world import blocks, object_slots, scene_state, tray
 from csac_jax.world.scene_state import SceneState
 
 HIGHEST = 0.25  # m, of the middle of an object that the camera at the side sees whole
@@ -57,10 +57,34 @@ def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Obs
     return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
 
 
+def seen_share(cfg: SceneConfig, scene: SceneState) -> jax.Array:
+    """Returns the share [] of the target that nothing covers from straight above, by 2 mm cells."""
+    fine = HeightmapConfig(size=224)
+    alone = scene_state.park(scene, scene_state.is_target(scene))
+
+    def cells(scene: SceneState) -> jax.Array:
+        shapes = scene_shapes(cfg, scene)
+        obs = ortho(fine, shapes, scene_tables(cfg, scene, shapes))
+        return jnp.sum(obs.target & (obs.height > 0.0), dtype=jnp.int32).astype(jnp.float32)
+
+    return cells(scene) / jnp.maximum(cells(alone), 1.0)
+
+
 def scene_shapes(cfg: SceneConfig, scene: SceneState) -> Shapes:
-    """Returns the convex parts of a scene's blocks and objects."""
-    objects = _objects(cfg, scene) if cfg.has_objects else None
-    return Shapes(polytopes(cfg.slots, scene), objects)
+    """Returns the convex parts of a scene's blocks, of the tray's walls after them, and objects."""
+    objects, parts = _objects(cfg, scene) if cfg.has_objects else None, polytopes(cfg.slots, scene)
+    if cfg.tray:
+        parts = jax.tree.map(lambda *two: jnp.concatenate(two), parts, _walls(cfg.tray))
+    return Shapes(parts, objects)
+
+
+def _walls(side: float) -> Polytopes:
+    centre, half = tray.walls(side)
+    boxes: tuple[SlotKind, ...] = ("box", "box", "box", "box")
+    normal, offset = blocks.half_spaces(boxes, jnp.asarray(half))
+    turn = jnp.broadcast_to(jnp.eye(3), (tray.NUMBER, 3, 3))
+    colour = jnp.broadcast_to(jnp.asarray(tray.COLOUR), (tray.NUMBER, 3))
+    return Polytopes(normal, offset, jnp.asarray(centre), turn, colour)
 
 
 def polytopes(slots: tuple[SlotKind, ...], scene: SceneState) -> Polytopes:
@@ -99,6 +123,9 @@ def scene_tables(
     """Returns lit colour and target flag of every surface of a scene, see `surface_tables`."""
     is_target = scene_state.is_target(scene)
     of_blocks = is_target[blocks.parts(cfg.slots).slot]
+    if cfg.tray:  # a wall is wanted where the table is
+        walls = jnp.broadcast_to(jnp.all(is_target), tray.NUMBER)
+        of_blocks = jnp.concatenate([of_blocks, walls])
     tables = surface_tables(shapes.blocks, of_blocks, light)
     if shapes.objects is None:
         return tables

@@ -21,7 +21,7 @@ from csac_jax.errors import SceneError
 from csac_jax.grippers import NUMBERS, Fingers, Grip, Gripper
 from csac_jax.robot import mjcf
 from csac_jax.section import require
-from csac_jax.world import blocks, object_models as objects, object_slots, scene_state
+from csac_jax.world import blocks, object_models as objects, object_slots, scene_state, tray
 from csac_jax.world.blocks import Parts
 from csac_jax.world.object_models import Bodies, ObjectFields
 from csac_jax.world.scene_state import SceneState
@@ -88,6 +88,8 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
         # With friction pyramids, as blocks have them, a held object creeps out of the hand.
         spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         spec.option.impratio = _CONE_IMPEDANCE
+    if scene.tray:
+        _add_walls(spec, scene.tray)
     for slot, place in enumerate(scene_state.parking(len(scene.slots))):
         body = spec.worldbody.add_body(name=f"block{slot}", pos=place)
         body.add_freejoint(name=f"block{slot}")
@@ -100,9 +102,19 @@ def _spec(scene: SceneConfig, sim: SimConfig, gripper: Gripper) -> mujoco.MjSpec
     spec.option.timestep = sim.timestep
     effort = (sim.iterations, sim.line_search) if library is None else _CONE_EFFORT
     spec.option.iterations, spec.option.ls_iterations = effort
-    spec.add_numeric(name="max_geom_pairs", data=[sim.geom_pairs])
+    # MJX sorts pairs by bounding spheres: those of the long walls are always near.
+    extra = tray.NUMBER * (len(scene.slots) + 1) if scene.tray else 0
+    spec.add_numeric(name="max_geom_pairs", data=[sim.geom_pairs + extra])
     spec.add_numeric(name="max_contact_points", data=[sim.contacts])
     return spec
+
+
+def _add_walls(spec: mujoco.MjSpec, side: float) -> None:
+    for number, (centre, half) in enumerate(zip(*tray.walls(side), strict=True)):
+        wall = spec.worldbody.add_geom(name=f"wall{number}", type=mujoco.mjtGeom.mjGEOM_BOX)
+        wall.pos, wall.size, wall.rgba = centre, half, [*tray.COLOUR, 1.0]
+        wall.contype, wall.conaffinity = 1, 3  # against blocks and hand
+        wall.friction = spec.geom("table").friction
 
 
 def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
@@ -129,6 +141,8 @@ def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> Non
 def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> None:
     """Adds the geoms of one slot, at the largest size of its kind."""
     largest = LARGEST * blocks.half_size_choices(kind).max(axis=0)
+    if kind == "box":  # it may lie on any side
+        largest = np.full(3, largest.max())
     for _, centre, half in zip(*blocks.parts((kind,)), strict=True):
         geom = body.add_geom(spec.find_default("blocks/block"))
         if kind in MESH_KINDS:

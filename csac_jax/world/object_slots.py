@@ -27,11 +27,18 @@ def table(cfg: SceneConfig) -> Tables:
 
 
 def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> SceneState:
-    """Draws the objects of a scene; none repeats before all have been drawn."""
+    """Draws the objects of a scene; none repeats before all have been drawn.
+
+    Raises SceneError where no object has a middle side in the range of the config.
+    """
     slots, objects = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
-    count = len(objects.half)
-    order = [rng.permutation(count) for _ in range(0, len(slots), count)]
-    return hold(scene, slots, np.concatenate(order)[: len(slots)], objects)
+    (low, high), middle = cfg.middle_side, 2.0 * np.sort(objects.half, axis=1)[:, 1]
+    fitting = np.flatnonzero((middle >= low) & (middle <= high))
+    if not fitting.size:
+        none = f"none of {len(middle)} objects has a middle side of {low:g} to {high:g} m"
+        raise SceneError(f"{none}; take another library, or raise its number of objects")
+    order = [rng.permutation(fitting.size) for _ in range(0, len(slots), fitting.size)]
+    return hold(scene, slots, fitting[np.concatenate(order)[: len(slots)]], objects)
 
 
 def hold(scene: SceneState, slots: np.ndarray, numbers: np.ndarray, objects: Tables) -> SceneState:
