@@ -18,8 +18,8 @@ from csac_jax.world.scene_state import SceneState
 
 
 class Trials(NamedTuple):
-    """Effects of actions. K = actions, N = block slots; a void trial, where physics diverged, has
-    none."""
+    """Effects of actions. K = actions, N = block slots; a trial has none where physics diverged, or
+    where a guarded descent was stopped."""
 
     scene: SceneState  # [K, N, ...] afterwards, without the blocks that were lifted or lost
     lifted: Array  # [K, N] bool, blocks in the hand, as the environment judges
@@ -53,12 +53,13 @@ def trial(
 ) -> Trials:
     """Simulates one action; returns leaves without the axis [K]."""
     after, trace, plan = simulation.execute(physics, cfg, scene, height, action)
-    sound = simulation.healthy(after)
+    guarded = cfg.sim.approach == "guarded"
+    sound = simulation.healthy(after) & ~(guarded & outcome.is_stopped(trace, action.primitive))
     after = jax.tree.map(functools.partial(jnp.where, sound), after, scene)
     hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
     is_grasp = action.primitive == Primitive.GRASP
     lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & sound
-    inside = scene_state.inside(after.position, cfg.heightmap.extent)
+    inside = scene_state.inside(after.position, cfg.scene.tray or cfg.heightmap.extent)
     lost = after.in_play & ~inside & ~lifted
     left = scene_state.park(after, ~lifted & ~lost)
     way = jnp.linalg.norm(left.position - scene.position, axis=1)

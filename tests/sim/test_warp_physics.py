@@ -115,7 +115,7 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
     (after, trace), (after_c, trace_c) = ran.warp, ran.c
     names = list(CASES)
     apart = np.linalg.norm(after.position - after_c.position, axis=2).max(axis=1)
-    pressed = {"touched": 5e-3, "spinning": 1e-2}  # small differences grow
+    pressed = {"touched": 5e-3, "spinning": 1e-2, "dropped": 2e-2}  # small differences grow
     for name, distance in zip(names, apart, strict=True):
         assert name == "nan" or distance < pressed.get(name, 1e-4), name
     well = np.array(names) != "nan"
