@@ -31,8 +31,6 @@ class SceneConfig(Section, section="scene"):
     """Library for slots of kind object: a folder, or procedural[+assemblies]:SEED:COUNT."""
     split: Literal["train", "held_out", "all"] = "train"
     """Objects of the library: those for training, those kept for evaluation, or all (for eval)."""
-    middle_side: Pair = number((0.0, 1.0), 0.0, 1.0)
-    """Range of the middle side of the objects that are drawn, m; their bounding box has three."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
@@ -48,7 +46,7 @@ class SceneConfig(Section, section="scene"):
         most = len(self.slots)
         require(most >= 1, "scene.slots: at least one block slot is needed")
         require(self.min_blocks <= most, f"scene.min_blocks: at most the {most} scene.slots")
-        for name in ("density", "friction", "drop_extent", "middle_side"):
+        for name in ("density", "friction", "drop_extent"):
             low, high = getattr(self, name)
             require(low <= high, f"scene.{name}: low <= high is needed")
         if self.has_objects:

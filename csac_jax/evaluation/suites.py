@@ -56,7 +56,7 @@ from csac_jax.objects.library import Split
 from csac_jax.scenes import arrange, cases, constructions, pool
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
-from csac_jax.world import model
+from csac_jax.world import model, object_slots
 from csac_jax.world.scene_state import SceneState
 
 IN_DISTRIBUTION = "in_distribution"
@@ -248,9 +248,11 @@ def _objects(cfg: Config, count: int, extent: float) -> Config:
     return _wide(cfg, scene).change(task={"max_actions": ACTIONS_EACH * count})
 
 
-def _pile(cfg: Config, episodes: int, stream: int) -> Env:
+def _pile(
+    cfg: Config, episodes: int, stream: int, sides: tuple[float, float] = object_slots.ANY_SIDE
+) -> Env:
     cfg = _objects(cfg, FEW, 0.10)  # extents as in VGN
-    return _env(cfg, pool.settled(cfg, stream, episodes, poured=True), MAX_FAILURES)
+    return _env(cfg, pool.settled(cfg, stream, episodes, poured=True, sides=sides), MAX_FAILURES)
 
 
 def _objects_packed(cfg: Config, episodes: int, stream: int) -> Env:
@@ -308,8 +310,8 @@ def _tight(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
     for gripper in ("rg2", "franka_hand"):
         opening = grippers.load(gripper).opening[1]
         sides = (TIGHT[0] * opening, TIGHT[1] * opening)
-        fitting = cfg.change(scene={"middle_side": sides}, sim={"gripper": gripper})
-        parts[f"{1e3 * opening:.0f}_mm"] = _pile(fitting, episodes, stream)
+        hand = cfg.change(sim={"gripper": gripper})
+        parts[f"{1e3 * opening:.0f}_mm"] = _pile(hand, episodes, stream, sides)
     return parts
 
 

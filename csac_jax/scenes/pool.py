@@ -68,14 +68,20 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
 
 
 def settled(
-    cfg: Config, stream: int, count: int, poured: bool = False, packed: bool = False
+    cfg: Config,
+    stream: int,
+    count: int,
+    poured: bool = False,
+    packed: bool = False,
+    sides: tuple[float, float] = object_slots.ANY_SIDE,
 ) -> SceneState:
     """Returns `count` distinct settled scenes for each number of blocks from `min_blocks` to N.
 
     NumPy leaves [P, N, ...], fewest blocks first; the same on every machine of one kind. Centres of
     blocks in play lie within extent / 2 of the workspace's, so a scene can be rotated by any yaw.
     Up to 12 blocks drop all at once. More, or all if `poured`, drop one after another; one that
-    rolls off drops again. If `packed`, objects stand on the table, see `object_slots.packed`.
+    rolls off drops again. If `packed`, objects stand on the table, see `object_slots.packed`. Of a
+    library, objects are drawn whose middle side lies in the range `sides`, m.
     Raises SceneError where hardly any scene comes to rest.
     """
     scene = dataclasses.replace(cfg.scene, packed_fraction=0.0)
@@ -87,7 +93,7 @@ def settled(
         done: list[SceneState] = []
         logged_at = time.monotonic()
         for number in numbers:
-            drop = functools.partial(_stand if packed else _drop, scene, rng, number)
+            drop = functools.partial(_stand if packed else _drop, scene, rng, number, sides)
             pouring = poured or (number > _MOST_DROPPED and not packed)
             fall = functools.partial(pour if pouring else rest, world, cfg)
             for fallen in _settle(world, drop, fall, count, costly=pouring or packed):
@@ -98,7 +104,8 @@ def settled(
         return _stack(done)
 
     how = ["poured"] * poured + ["packed"] * packed
-    if len(scene.slots) > _MOST_DROPPED and not how:
+    how += [f"sides {sides}"] * (sides != object_slots.ANY_SIDE)
+    if len(scene.slots) > _MOST_DROPPED and not (poured or packed):
         how = [f"poured above {_MOST_DROPPED}"]
     return _stored(_digest(cfg, stream, count, *how), settle)
 
@@ -156,7 +163,12 @@ def _stack(scenes: list[SceneState]) -> SceneState:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *scenes)
 
 
-def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> SceneState:
+def _drop(
+    cfg: SceneConfig,
+    rng: np.random.Generator,
+    count: int,
+    sides: tuple[float, float] = object_slots.ANY_SIDE,
+) -> SceneState:
     """Draws a scene of `count` blocks before they fall, one above the other as in VPG."""
     num, num_colours = len(cfg.slots), len(blocks.COLOURS)
     in_play = rng.permutation(num) < count
@@ -179,15 +191,17 @@ def _drop(cfg: SceneConfig, rng: np.random.Generator, count: int) -> SceneState:
         colour=rng.permutation(max(num, num_colours))[:num].astype(np.int32) % num_colours,
         in_play=in_play,
     )
-    return object_slots.drawn(rng, cfg, dropped) if cfg.has_objects else dropped
+    return object_slots.drawn(rng, cfg, dropped, sides) if cfg.has_objects else dropped
 
 
-def _stand(cfg: SceneConfig, rng: np.random.Generator, count: int) -> SceneState:
+def _stand(
+    cfg: SceneConfig, rng: np.random.Generator, count: int, sides: tuple[float, float]
+) -> SceneState:
     """Draws a scene of `count` objects that stand side by side; again where there is no room."""
     for _ in range(_DRAWS - 1):
         with contextlib.suppress(SceneError):
-            return object_slots.packed(rng, cfg, _drop(cfg, rng, count))
-    return object_slots.packed(rng, cfg, _drop(cfg, rng, count))
+            return object_slots.packed(rng, cfg, _drop(cfg, rng, count, sides))
+    return object_slots.packed(rng, cfg, _drop(cfg, rng, count, sides))
 
 
 def _falling(world: World, scene: SceneState, fields: BlockFields) -> mujoco.MjData:

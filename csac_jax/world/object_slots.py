@@ -26,13 +26,22 @@ def table(cfg: SceneConfig) -> Tables:
     return tables.from_library(library(cfg))
 
 
-def drawn(rng: np.random.Generator, cfg: SceneConfig, scene: SceneState) -> SceneState:
+ANY_SIDE = (0.0, np.inf)  # m
+
+
+def drawn(
+    rng: np.random.Generator,
+    cfg: SceneConfig,
+    scene: SceneState,
+    sides: tuple[float, float] = ANY_SIDE,
+) -> SceneState:
     """Draws the objects of a scene; none repeats before all have been drawn.
 
-    Raises SceneError where no object has a middle side in the range of the config.
+    Only objects are drawn whose bounding box has a middle side in the range `sides`, m. Raises
+    SceneError where there is none.
     """
     slots, objects = np.flatnonzero(blocks.is_object(cfg.slots)), table(cfg)
-    (low, high), middle = cfg.middle_side, 2.0 * np.sort(objects.half, axis=1)[:, 1]
+    (low, high), middle = sides, 2.0 * np.sort(objects.half, axis=1)[:, 1]
     fitting = np.flatnonzero((middle >= low) & (middle <= high))
     if not fitting.size:
         none = f"none of {len(middle)} objects has a middle side of {low:g} to {high:g} m"

@@ -18,7 +18,7 @@ from csac_jax.errors import SceneError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.nets import networks
 from csac_jax.objects import tables
-from csac_jax.scenes import cases, constructions
+from csac_jax.scenes import cases, constructions, pool
 from csac_jax.vision import heightmap, observe
 from csac_jax.world import model, object_slots
 from csac_jax.world.scene_state import SceneState
@@ -99,7 +99,7 @@ def test_hidden_shows_what_its_parts_say():
     fine = next(iter(parts.values())).cfg.change(heightmap={"size": 128})
     look = jax.jit(functools.partial(observe.observe, fine))
     for name, env in parts.items():
-        low, high = suites.SEEN[name]
+        low, high = {"seen_50_100": (0.5, 1.0), "seen_1_50": (0.01, 0.5), "seen_0": (0, 0)}[name]
         for row in range(min(len(env.scenes.target), 4)):
             scene = _scene(env, row)
             share = _share_in_c(world, scene)
@@ -156,12 +156,12 @@ def test_tight_objects_hardly_fit(monkeypatch: pytest.MonkeyPatch):
     its two hands, 110 and 80 mm; none that fits is a one-line error."""
     drawn = {}
 
-    def pile(cfg, episodes, stream):
-        scene = suites.pool._drop(cfg.scene, np.random.default_rng(stream), 1)
+    def settled(cfg, stream, count, poured, sides):
+        scene = pool._drop(cfg.scene, np.random.default_rng(stream), 5, sides)
         drawn[grippers.load(cfg.sim.gripper).opening[1]] = cfg.scene, scene
-        return cfg
+        return scene
 
-    monkeypatch.setattr(suites, "_pile", pile)
+    monkeypatch.setattr(pool, "settled", settled)
     library = "procedural:0:60"
     assert [*suites.prepare(CFG, "tight", 2, objects=library).parts] == ["110_mm", "80_mm"]
     for opening, (scene, state) in drawn.items():
@@ -169,11 +169,9 @@ def test_tight_objects_hardly_fit(monkeypatch: pytest.MonkeyPatch):
         share = 2.0 * np.sort(half, axis=1)[:, 1] / opening
         assert ((share >= 0.6) & (share <= 0.95)).all()
     assert sorted(drawn) == [0.08, 0.11]
-    few = suites.SceneConfig(
-        slots=("object",), min_blocks=1, objects=library, middle_side=(0.9, 1.0)
-    )
+    few = suites.SceneConfig(slots=("object",), min_blocks=1, objects=library)
     with pytest.raises(SceneError, match=r"^none of \d+ objects has a middle side of 0\.9 to 1 m"):
-        suites.pool._drop(few, np.random.default_rng(0), 1)
+        pool._drop(few, np.random.default_rng(0), 1, (0.9, 1.0))
 
 
 def test_folder_of_cases(tmp_path: Path):

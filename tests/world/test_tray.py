@@ -1,6 +1,5 @@
 """The tray: walls that hold blocks, in every place that knows of them."""
 
-import dataclasses
 import functools
 
 import jax
@@ -176,10 +175,10 @@ def test_a_tray_that_does_not_fit_is_one_line(change: dict, line: str):
 
 
 def test_pools_without_tray_keep_their_names():
-    """Claim: pools of scenes without a tray are found under the names of before, others not."""
-    plain = Config()
-    digest = pool._digest(plain, 0, 8)
-    older = repr(dataclasses.replace(plain.scene)).replace(", tray=0.0", "")
-    assert "tray" not in older
-    assert pool._digest(plain.change(scene={"tray": 0.3}), 0, 8) != digest
-    assert pool._digest(plain.change(scene={"middle_side": (0.0, 0.1)}), 0, 8) != digest
+    """Claim: the digest of a pool names the tray only where there is one: shipped pools, which are
+    older, are still found."""
+    plain = presets.quick()
+    digest = pool._digest(plain, pool.TRAIN_STREAM, plain.scene.pool)
+    assert (pool.shipped() / f"{digest}.npz").is_file()
+    walled = plain.change(scene={"tray": 0.3})
+    assert pool._digest(walled, pool.TRAIN_STREAM, plain.scene.pool) != digest
