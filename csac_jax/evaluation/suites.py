@@ -39,6 +39,7 @@ import jax
 import numpy as np
 
 from csac_jax import env as environment, grippers
+from csac_jax.assets import assets
 from csac_jax.config import (
     Config,
     PhysicsKind,
@@ -53,7 +54,7 @@ from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import Env
 from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
-from csac_jax.scenes import arrange, cases, constructions, pool
+from csac_jax.scenes import arrange, cases, certify, constructions, pool
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, object_slots
@@ -269,30 +270,22 @@ def _as_target(env: Env) -> Env:
     return _with_task(env, TARGET)
 
 
-def _constructed(suite: str, episodes: int, stream: int) -> SceneState:
-    """Draws scenes of the constructions that test a suite, in turn; leaves [P, N, ...]."""
-    key = jax.random.key(stream)
-    makes = [one.make for one in constructions.TEST.values() if one.suite == suite]
-    keys = [jax.random.fold_in(key, number) for number in range(episodes)]
-    scenes = [makes[number % len(makes)](key) for number, key in enumerate(keys)]
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *scenes)
-
-
-def _pushes(suite: str, cfg: Config, episodes: int, stream: int) -> Env:
+def _pushes(suite: str, cfg: Config, *_: int) -> Env:
     """Builds a suite whose scenes need pushes; 2.5 actions for each block or more, as dropped."""
     scene = constructions.SUITES[suite]
     actions = max(cfg.task.max_actions, len(scene.slots) * 5 // 2)
     cfg = _wide(cfg, scene).change(task={"max_actions": actions})
-    return _env(cfg, _constructed(suite, episodes, stream), MAX_FAILURES)
+    certified = certify.load(assets() / "certified" / f"{suite}.npz")
+    return _env(cfg, certified.scenes, MAX_FAILURES)
 
 
 def _with_task(env: Env, task: dict[str, Any]) -> Env:
     return dataclasses.replace(env, cfg=env.cfg.change(task=task))
 
 
-def _hidden(cfg: Config, episodes: int, stream: int) -> dict[str, Env]:
-    """Builds a part for each range of what is seen of the target; the scenes of one draw."""
-    env = _with_task(_pushes("hidden", cfg, len(SEEN) * episodes, stream), HIDDEN)
+def _hidden(cfg: Config, *_: int) -> dict[str, Env]:
+    """Builds a part for each range of what is seen of the target."""
+    env = _with_task(_pushes("hidden", cfg), HIDDEN)
     share = functools.partial(observe.seen_share, env.cfg.scene)
     shares = np.asarray(jax.jit(functools.partial(jax.lax.map, share))(env.scenes))
     return {
