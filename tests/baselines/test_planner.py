@@ -102,7 +102,7 @@ def test_planner_pushes_towards_a_grasp():
     """Claim: where no grasp lifts the target, the planner takes the push after which the most
     grasps do, and one that changes nothing is not it."""
     state, physics = _start(TARGET, MIDDLE), planner.make_physics(TARGET)
-    grasps, tried = _tried(TARGET, FEW.grasps)(state, jax.random.key(1))
+    grasps, tried = _tried(TARGET, FEW.grasps)(state, jax.random.key(3))
     assert not np.any(tried.wanted)
     pushes = planner.sample_pushes(jax.random.key(0), TARGET, state.scene, FEW.pushes)
     in_the_air = Action.push(0.2, 0.2, 0.0)

@@ -66,7 +66,12 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
     assert {*evaluate._fitting(options, clear)} == of_blocks >= {"random10", "cases", "camera"}
     with_objects = evaluate.EvalOptions("shipped", objects="procedural:0:20")
     assert "pile" in evaluate._fitting(with_objects, clear)
-    assert evaluate._fitting(with_objects, target) == ("target", "target_objects")
+    assert evaluate._fitting(with_objects, target) == (
+        "target",
+        "target_objects",
+        "enclosed",
+        "hidden",
+    )
     anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 

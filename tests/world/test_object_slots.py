@@ -67,9 +67,9 @@ def test_objects_for_which_there_is_no_room_are_drawn_again():
     rooms = []
     for seed in range(10):
         rng = np.random.default_rng(seed)
-        assert pool._stand(narrow, rng, 5).in_play.all()
+        assert pool._stand(narrow, rng, 5, (0.0, 1.0)).in_play.all()
         with contextlib.suppress(SceneError):
-            rooms.append(object_slots.packed(rng, narrow, pool._drop(narrow, rng, 5)))
+            rooms.append(object_slots.packed(rng, narrow, pool._drop(narrow, rng, 5, (0.0, 1.0))))
     assert len(rooms) < 10
     smallest = dataclasses.replace(narrow, drop_extent=(0.05, 0.05))
     with pytest.raises(SceneError, match=r"no room for '.*' .* in a square of 0\.05 m"):
