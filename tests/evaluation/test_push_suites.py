@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from csac_jax import grippers, presets
-from csac_jax.assets import assets
 from csac_jax.agent import maps
+from csac_jax.assets import assets
 from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.errors import SceneError
@@ -51,7 +51,8 @@ def test_suite_is_built_and_rolls_out(suite: str):
     assert set(parts) <= (set(suites.SEEN) if suite == "hidden" else {suite})
     certified = certify.load(assets() / "certified" / f"{suite}.npz")
     assert {constructions.TEST[one.generator].suite for one in certified.kept} == {suite}
-    assert sum(len(env.scenes.target) for env in parts.values()) == len(certified.kept)
+    rows = sum(len(env.scenes.target) for env in parts.values())
+    assert rows == len(certified.kept) if suite != "hidden" else 10 < rows <= len(certified.kept)
     for env in parts.values():
         assert env.cfg.scene == constructions.SUITES[suite]
         assert env.max_failures == 2

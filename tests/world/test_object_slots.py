@@ -73,7 +73,7 @@ def test_objects_for_which_there_is_no_room_are_drawn_again():
     assert len(rooms) < 10
     smallest = dataclasses.replace(narrow, drop_extent=(0.05, 0.05))
     with pytest.raises(SceneError, match=r"no room for '.*' .* in a square of 0\.05 m"):
-        pool._stand(smallest, rng, 5)
+        pool._stand(smallest, rng, 5, (0.0, 1.0))
 
 
 def test_packed_objects_stand_apart():
