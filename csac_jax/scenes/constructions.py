@@ -32,7 +32,7 @@ _SHIFT = 0.02  # m, most along x and y from the middle of the workspace
 _SIDES = ((1, 0), (0, 1), (-1, 0), (0, -1))  # directions x, y
 
 
-class Piece(NamedTuple):
+class Laid(NamedTuple):
     """A block with sides along x and y, before the whole is turned."""
 
     middle: tuple[float, float]  # m
@@ -65,7 +65,7 @@ class _Draw:
         return self(*_LONG)
 
 
-Place = Callable[[_Draw], list[Piece]]  # the first piece is the target
+Place = Callable[[_Draw], list[Laid]]  # the first piece is the target
 
 
 def make(suite: str, place: Place, key: jax.Array) -> SceneState:
@@ -118,36 +118,36 @@ def _middles(widths: list[float]) -> list[float]:
     return (np.cumsum(widths) - 0.5 * np.array(widths)).tolist()
 
 
-def _bars(draw: _Draw) -> list[Piece]:
+def _bars(draw: _Draw) -> list[Laid]:
     """Lays four to six bars longer than the opening side by side."""
     widths, high = draw.many(int(draw.rng.integers(4, 7)), 0.030, 0.045), draw(0.035, 0.050)
     row = zip(_middles(widths), widths, strict=True)
-    return [Piece((0.0, y), (draw.long(), width, high)) for y, width in row]
+    return [Laid((0.0, y), (draw.long(), width, high)) for y, width in row]
 
 
-def _grid(draw: _Draw) -> list[Piece]:
+def _grid(draw: _Draw) -> list[Laid]:
     """Lays three rows of three blocks."""
     columns, rows, high = draw.many(3, 0.05, 0.062), draw.many(3, 0.05, 0.062), draw(0.035, 0.05)
     xs, ys = _middles(columns), _middles(rows)
-    return [Piece((xs[i], ys[j]), (columns[i], rows[j], high)) for i in range(3) for j in range(3)]
+    return [Laid((xs[i], ys[j]), (columns[i], rows[j], high)) for i in range(3) for j in range(3)]
 
 
-def _slabs(draw: _Draw) -> list[Piece]:
+def _slabs(draw: _Draw) -> list[Laid]:
     """Lays two slabs together, each longer than the opening and half as wide."""
     widths, high = draw.many(2, 0.058, 0.070), draw(0.030, 0.050)
     row = zip(_middles(widths), widths, strict=True)
-    return [Piece((draw(-0.004, 0.004), y), (draw.long(), width, high)) for y, width in row]
+    return [Laid((draw(-0.004, 0.004), y), (draw.long(), width, high)) for y, width in row]
 
 
-def _arcade(draw: _Draw) -> list[Piece]:
+def _arcade(draw: _Draw) -> list[Laid]:
     """Lays three arches longer than the opening tunnel to tunnel, between two bars."""
     kinds: tuple[SlotKind, ...] = ("box", "arch", "arch", "arch", "box")
     widths, high = draw.many(5, 0.035, 0.055), draw(0.045, 0.055)
     row = zip(_middles(widths), widths, kinds, strict=True)
-    return [Piece((0.0, y), (draw.long(), width, high), kind=kind) for y, width, kind in row]
+    return [Laid((0.0, y), (draw.long(), width, high), kind=kind) for y, width, kind in row]
 
 
-def _parquet(draw: _Draw) -> list[Piece]:
+def _parquet(draw: _Draw) -> list[Laid]:
     """Lays four pairs of bars, each pair across its neighbours."""
     length, high, pieces = draw.long(), draw(0.035, 0.050), []
     for number, (x, y) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
@@ -157,18 +157,18 @@ def _parquet(draw: _Draw) -> list[Piece]:
             middle, size = (x * along, y * along + aside), (length, part * length, high)
             if number % 2:
                 middle, size = (x * along + aside, y * along), (part * length, length, high)
-            pieces.append(Piece(middle, size))
+            pieces.append(Laid(middle, size))
     return pieces
 
 
-def _steps(draw: _Draw) -> list[Piece]:
+def _steps(draw: _Draw) -> list[Laid]:
     """Lays five bars like steps: each begins farther along than the one before."""
     widths, high, slant = draw.many(5, 0.034, 0.048), draw(0.035, 0.050), draw(0.010, 0.022)
     row = enumerate(zip(_middles(widths), widths, strict=True))
-    return [Piece((i * slant, y), (draw.long(), width, high)) for i, (y, width) in row]
+    return [Laid((i * slant, y), (draw.long(), width, high)) for i, (y, width) in row]
 
 
-def _around(side: float, sizes: list[tuple[float, float]], high: float) -> list[Piece]:
+def _around(side: float, sizes: list[tuple[float, float]], high: float) -> list[Laid]:
     """Places four blocks round a square of `side` m, each flush with the inside of the next.
 
     Args: sizes, away from the square and along it, m.
@@ -177,68 +177,68 @@ def _around(side: float, sizes: list[tuple[float, float]], high: float) -> list[
     for (x, y), (wide, long) in zip(_SIDES, sizes, strict=True):
         out, along = 0.5 * (side + wide), 0.5 * (long - side)
         lying = (long, wide) if y else (wide, long)
-        pieces.append(Piece((x * out + y * along, y * out - x * along), (*lying, high)))
+        pieces.append(Laid((x * out + y * along, y * out - x * along), (*lying, high)))
     return pieces
 
 
-def _frame(draw: _Draw) -> list[Piece]:
+def _frame(draw: _Draw) -> list[Laid]:
     """Encloses a block between two short blocks, and these between two bars."""
     (x, y), high = draw.many(2, 0.038, 0.044), draw(0.038, 0.050)
     ends, sides = draw.many(2, 0.038, 0.040), draw.many(2, 0.040, 0.055)
-    pieces, middle = [Piece((0.0, 0.0), (x, y, high))], 0.5 * (ends[1] - ends[0])
+    pieces, middle = [Laid((0.0, 0.0), (x, y, high))], 0.5 * (ends[1] - ends[0])
     for way, end, side in zip((-0.5, 0.5), ends, sides, strict=True):
-        pieces.append(Piece((way * (x + end), 0.0), (end, y, high)))
-        pieces.append(Piece((middle, way * (y + side)), (x + sum(ends), side, high)))
+        pieces.append(Laid((way * (x + end), 0.0), (end, y, high)))
+        pieces.append(Laid((middle, way * (y + side)), (x + sum(ends), side, high)))
     return pieces
 
 
-def _dock(draw: _Draw) -> list[Piece]:
+def _dock(draw: _Draw) -> list[Laid]:
     """Puts a long block into a U of three bars; its free end is flush with theirs."""
     length, width, high = draw.long(), draw(0.038, 0.040), draw(0.035, 0.050)
     arms, back = draw.many(2, 0.038, 0.042), draw(0.036, 0.050)
-    pieces = [Piece((0.0, 0.0), (length, width, high))]
+    pieces = [Laid((0.0, 0.0), (length, width, high))]
     for way, arm in zip((-0.5, 0.5), arms, strict=True):
-        pieces.append(Piece((0.0, way * (width + arm)), (length, arm, high)))
+        pieces.append(Laid((0.0, way * (width + arm)), (length, arm, high)))
     behind, aside = -0.5 * (length + back), 0.5 * (arms[1] - arms[0])
-    return [*pieces, Piece((behind, aside), (back, width + sum(arms), high))]
+    return [*pieces, Laid((behind, aside), (back, width + sum(arms), high))]
 
 
-def _courtyard(draw: _Draw) -> list[Piece]:
+def _courtyard(draw: _Draw) -> list[Laid]:
     """Puts a low block or a cylinder between four high ones whose sides exceed the opening."""
     side, high = draw(0.046, 0.054), draw(0.052, 0.070)
-    target = Piece((0.0, 0.0), (side, side, draw(0.030, 0.045)))
+    target = Laid((0.0, 0.0), (side, side, draw(0.030, 0.045)))
     if draw(0.0, 1.0) < 0.4:
-        target = Piece((0.0, 0.0), (0.0448, 0.0448, 0.05), kind="cylinder", exact=True)
+        target = Laid((0.0, 0.0), (0.0448, 0.0448, 0.05), kind="cylinder", exact=True)
     return [target, *_around(side, [(draw.long(), draw.long()) for _ in _SIDES], high)]
 
 
-def _pinwheel(draw: _Draw) -> list[Piece]:
+def _pinwheel(draw: _Draw) -> list[Laid]:
     """Encloses a block by four bars; each ends at the side of the next."""
     side, wide, high = draw(0.048, 0.058), draw(0.062, 0.066), draw(0.035, 0.050)
     ring = _around(side, [(wide, wide + side)] * 4, high)
-    return [Piece((0.0, 0.0), (side, side, high)), *ring]
+    return [Laid((0.0, 0.0), (side, side, high)), *ring]
 
 
-def _rings(draw: _Draw) -> list[Piece]:
+def _rings(draw: _Draw) -> list[Laid]:
     """Encloses a narrow block by two rings of four bars."""
     side, high, (inner, outer) = draw(0.028, 0.032), draw(0.035, 0.050), draw.many(2, 0.028, 0.030)
     across = side + 2.0 * inner
     rings = _around(side, [(inner, inner + side)] * 4, high)
     rings += _around(across, [(outer, outer + across)] * 4, high)
-    return [Piece((0.0, 0.0), (side, side, high)), *rings]
+    return [Laid((0.0, 0.0), (side, side, high)), *rings]
 
 
-def _corners(draw: _Draw) -> list[Piece]:
+def _corners(draw: _Draw) -> list[Laid]:
     """Puts a block into each of two to four corners of the tray."""
     pieces, count = [], int(draw.rng.integers(2, 5))
     for x, y in ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))[:count]:
         wide, long = draw.many(2, 0.045, 0.085)
         middle = x * (TRAY - wide), y * (TRAY - long)
-        pieces.append(Piece(middle, (wide, long, draw(0.030, 0.050))))
+        pieces.append(Laid(middle, (wide, long, draw(0.030, 0.050))))
     return pieces
 
 
-def _moored(draw: _Draw) -> list[Piece]:
+def _moored(draw: _Draw) -> list[Laid]:
     """Puts two to four blocks longer than the opening along the walls of the tray."""
     kinds: tuple[SlotKind, ...] = ("box", "arch", "box", "box")
     pieces, count = [], int(draw.rng.integers(2, 5))
@@ -247,26 +247,26 @@ def _moored(draw: _Draw) -> list[Piece]:
         size = (long, wide) if y else (wide, long)
         out = 0.5 * (TRAY - wide)
         middle = x * out + y * aside, y * out + x * aside
-        pieces.append(Piece(middle, (*size, draw(0.035, 0.050)), kind=kind))
+        pieces.append(Laid(middle, (*size, draw(0.035, 0.050)), kind=kind))
     return pieces
 
 
-def _shelf(draw: _Draw) -> list[Piece]:
+def _shelf(draw: _Draw) -> list[Laid]:
     """Fills one side of the tray, from wall to wall, with five blocks of one depth."""
     parts, deep, high = draw.many(5, 0.9, 1.1), draw(0.045, 0.065), draw(0.035, 0.050)
     widths, y = [TRAY * part / sum(parts) for part in parts], 0.5 * (TRAY - deep)
     row = zip(_middles(widths), widths, strict=True)
-    return [Piece((x - 0.5 * TRAY, y), (width, deep, high)) for x, width in row]
+    return [Laid((x - 0.5 * TRAY, y), (width, deep, high)) for x, width in row]
 
 
-def _nook(draw: _Draw) -> list[Piece]:
+def _nook(draw: _Draw) -> list[Laid]:
     """Puts an L of three blocks into a corner of the tray."""
     (x, y), high, low = draw.many(2, 0.05, 0.062), draw(0.035, 0.05), -0.5 * TRAY
     along, aside = draw.many(2, 0.05, 0.08)
     return [
-        Piece((low + 0.5 * x, low + 0.5 * y), (x, y, high)),
-        Piece((low + x + 0.5 * along, low + 0.5 * y), (along, y, high)),
-        Piece((low + 0.5 * x, low + y + 0.5 * aside), (x, aside, high)),
+        Laid((low + 0.5 * x, low + 0.5 * y), (x, y, high)),
+        Laid((low + x + 0.5 * along, low + 0.5 * y), (along, y, high)),
+        Laid((low + 0.5 * x, low + y + 0.5 * aside), (x, aside, high)),
     ]
 
 
@@ -276,21 +276,21 @@ def _seen(draw: _Draw) -> float:
     return (0.0, share, share + 0.5)[draw.rng.integers(3)]
 
 
-def _roof(draw: _Draw) -> list[Piece]:
+def _roof(draw: _Draw) -> list[Laid]:
     """Puts a block between two rails with a bar behind, and a plate over them."""
     long, high, share = draw.long(), draw(0.028, 0.040), _seen(draw)
     (x, y), rails, bar = draw.many(2, 0.042, 0.048), draw.many(2, 0.036, 0.038), draw(0.036, 0.045)
     deep = 0.0 if share else draw(0.005, 0.05)  # the target lies so far under the plate
-    pieces = [Piece((0.5 * x + deep, 0.0), (x, y, high))]
+    pieces = [Laid((0.5 * x + deep, 0.0), (x, y, high))]
     for way, rail in zip((-0.5, 0.5), rails, strict=True):
-        pieces.append(Piece((0.5 * long, way * (y + rail)), (long, rail, high)))
+        pieces.append(Laid((0.5 * long, way * (y + rail)), (long, rail, high)))
     behind = long + 0.5 * bar, 0.5 * (rails[1] - rails[0])
-    pieces.append(Piece(behind, (bar, y + sum(rails), high)))  # else a pressed plate would tip
+    pieces.append(Laid(behind, (bar, y + sum(rails), high)))  # else a pressed plate would tip
     plate = draw.long(), draw.long(), draw(0.012, 0.020)
-    return [*pieces, Piece((share * x + 0.5 * plate[0], 0.0), plate, floor=high)]
+    return [*pieces, Laid((share * x + 0.5 * plate[0], 0.0), plate, floor=high)]
 
 
-def _shed(draw: _Draw) -> list[Piece]:
+def _shed(draw: _Draw) -> list[Laid]:
     """Puts a block and a filler between rails, and a plate that leaves one side of them open."""
     (x, y), high, share = draw.many(2, 0.042, 0.050), draw(0.028, 0.040), _seen(draw)
     rail, wide, last, long = draw(0.034, 0.040), draw(0.062, 0.068), draw(0.042, 0.048), draw.long()
@@ -299,25 +299,25 @@ def _shed(draw: _Draw) -> list[Piece]:
     plate = long + draw(-0.004, 0.004), draw.long(), draw(0.014, 0.022)
     start = share * y if share else draw(-0.015, -0.005)
     return [
-        Piece((0.5 * x, 0.5 * y), (x, y, high)),
-        Piece((long - 0.5 * filler, 0.5 * inner), (filler, inner, high)),
-        Piece((0.5 * long, -0.5 * rail), (long, rail, high)),
-        Piece((0.5 * long, inner + 0.5 * wide), (long, wide, high)),
-        Piece((0.5 * long, inner + wide + 0.5 * last), (long, last, high)),
-        Piece((0.5 * long, start + 0.5 * plate[1]), plate, floor=high, exact=True),
+        Laid((0.5 * x, 0.5 * y), (x, y, high)),
+        Laid((long - 0.5 * filler, 0.5 * inner), (filler, inner, high)),
+        Laid((0.5 * long, -0.5 * rail), (long, rail, high)),
+        Laid((0.5 * long, inner + 0.5 * wide), (long, wide, high)),
+        Laid((0.5 * long, inner + wide + 0.5 * last), (long, last, high)),
+        Laid((0.5 * long, start + 0.5 * plate[1]), plate, floor=high, exact=True),
     ]
 
 
-def _vault(draw: _Draw) -> list[Piece]:
+def _vault(draw: _Draw) -> list[Laid]:
     """Puts a bar between two piers whose sides exceed the opening, and a plate over the three."""
     wide, long, low = draw(0.036, 0.050), draw.long(), draw(0.025, 0.040)
     high, share = low + draw(0.0, 0.004), min(_seen(draw), 0.4)  # beyond, the plate would fall
-    pieces = [Piece((0.0, 0.0), (wide, long, low))]
+    pieces = [Laid((0.0, 0.0), (wide, long, low))]
     for way in (-0.5, 0.5):
         pier = draw.long()
-        pieces.append(Piece((way * (wide + pier), draw(-0.003, 0.003)), (pier, long, high)))
+        pieces.append(Laid((way * (wide + pier), draw(-0.003, 0.003)), (pier, long, high)))
     plate = draw.long(), long, draw(0.012, 0.020)
-    return [*pieces, Piece((0.0, share * long), plate, floor=high, exact=True)]
+    return [*pieces, Laid((0.0, share * long), plate, floor=high, exact=True)]
 
 
 def _constructions(**places: tuple[str, Place]) -> dict[str, Construction]:

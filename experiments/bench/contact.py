@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from csac_jax.baselines import trials
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
-from csac_jax.sim import c_physics, outcome, physics as simulation
+from csac_jax.sim import c_physics, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
@@ -29,13 +30,10 @@ TURNS = 24  # yaws of the hand that comes down on a cube
 
 
 def _cubes(places: Any) -> SceneState:
-    count = len(places)
-    scene = scene_state.parked(("box",) * count)
-    return scene.replace(
-        position=np.float32([[x, y, 0.5 * SIDE] for x, y in places]),
-        half_size=np.full((count, 3), 0.5 * SIDE, np.float32),
-        in_play=np.ones(count, bool),
-    )
+    position = np.float32([[x, y, 0.5 * SIDE] for x, y in places])
+    half = np.full_like(position, 0.5 * SIDE)
+    scene = scene_state.parked(("box",) * len(places))
+    return scene.replace(position=position, half_size=half, in_play=np.ones(len(places), bool))
 
 
 def _packed(rows: int, columns: int) -> SceneState:
@@ -57,19 +55,17 @@ def _config(count: int, **sim: Any) -> Config:
 
 def _lifts(cfg: Config, scene: SceneState, poses: np.ndarray) -> float:
     """Returns the share of grasps at poses [A, 3] after which some block hangs in the hand."""
-    engine = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
     scene = jax.tree.map(jnp.asarray, scene)
-    height = observe.observe(cfg, scene, None).height
+    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    height = trials.height_map(cfg, scene)
 
-    def lifted(pose: jax.Array) -> jax.Array:
-        action = Action(primitive=jnp.int32(Primitive.GRASP), pose=pose)
-        _, trace, plan = simulation.execute(engine, cfg, scene, height, action)
-        hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-        stopped = outcome.is_stopped(trace, action.primitive) & (cfg.sim.approach == "guarded")
-        return jnp.any(outcome.lifted_blocks(trace, hand_rise)) & ~stopped
+    @jax.jit
+    def lifted(poses: jax.Array) -> jax.Array:
+        actions = Action(jnp.full(len(poses), Primitive.GRASP, jnp.int32), poses)
+        return jnp.any(trials.simulate(cfg, physics, scene, height, actions).lifted, axis=1)
 
     batches = np.array_split(np.float32(poses), -(-len(poses) // 1024))
-    return float(np.concatenate([jax.jit(jax.vmap(lifted))(batch) for batch in batches]).mean())
+    return float(np.concatenate([lifted(batch) for batch in batches]).mean())
 
 
 def sink(force: float) -> dict[str, float]:

@@ -233,7 +233,7 @@ def _resting(bench: Bench, cfg: Config, shape: str, count: int) -> SceneState:
         scene.quaternion[slot] = rotation / np.linalg.norm(rotation)
         dropped = scene.replace(in_play=np.arange(len(scene.half_size)) == slot)
         fields = jax.device_get(model.scene_fields(bench.world, dropped))
-        ended = pool.rest(bench.world, cfg.scene, cfg.heightmap.extent, dropped, fields)
+        ended = pool.rest(bench.world, cfg, dropped, fields)
         at_rest += [ended] if ended is not None else []
     return jax.tree.map(lambda *leaves: np.stack(leaves), *at_rest)
 
