@@ -40,7 +40,7 @@ class SceneConfig(Section, section="scene"):
     friction: Pair = number((0.5, 1.0), 0.1, 2.0)  # Range of sliding friction, blocks and table.
     drop_extent: Pair = number((0.248, 0.248), 0.05, 0.448)  # Side of a dropped pile, m (VPG).
     settle_time: float = number(2.5, 0.5, 20.0)  # Time for blocks to come to rest, s (ours).
-    tray: float = number(0.0, 0.0, 1.0)  # Inner side of a square tray with walls, m; 0: no tray.
+    tray: float = number(0.0, 0.0, 1.0)  # Inner side of a walled tray, m; 0: none (for eval).
 
     def check(self) -> None:
         most = len(self.slots)
@@ -98,14 +98,16 @@ class SimConfig(Section, section="sim"):
     clearance: float = number(0.0, 0.0, 0.05)  # Least height of the tips, m; 0: the gripper's.
     opening: Literal["full", "fit"] = "full"
     """Fingers on the way down to a grasp: `full`, open at the place that was decided; `fit`, 10 mm
-    beside what the map shows between them, centred on it (ours: robot/fit.py)."""
+    beside what the map shows between them, centred on it (ours: robot/fit.py; for eval)."""
     down_force: float = number(20.0, 0.0, 200.0, above=True)
-    """Most force of the hand downwards, N; what resists more stops it (ours: a cautious arm)."""
+    """Most force of the hand downwards, N; what resists more stops it (ours; for own arms)."""
     approach: Literal["free", "guarded"] = "free"
     """`guarded`: a hand that meets more than `down_force` on its way down goes back, and nothing
-    else happens."""
-    pad_friction: Pair = number((0.0, 0.0), 0.0, 2.0)  # Of the pads, by episode; 0: the gripper's.
-    grip_force: Pair = number((0.0, 0.0), 0.0, 200.0)  # N, by episode; 0: the gripper's.
+    else happens (for own arms)."""
+    pad_friction: Pair = number((0.0, 0.0), 0.0, 2.0)
+    """Friction of the pads, drawn by episode; 0: the gripper's (for own grippers)."""
+    grip_force: Pair = number((0.0, 0.0), 0.0, 200.0)
+    """Force of the grip, N, drawn by episode; 0: the gripper's (for own grippers)."""
     grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
     geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
     contacts: int = number(48, 1)  # Contacts that MJX and Warp keep per step.

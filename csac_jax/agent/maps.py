@@ -76,8 +76,10 @@ def frames(cfg: Config, networks: Networks) -> Frames:
 
 
 def _walls(cfg: Config) -> np.ndarray:
-    with jax.ensure_compile_time_eval():
-        xy = np.asarray(geometry.cell_centres(cfg.heightmap))
+    size, cell = cfg.heightmap.size, cfg.heightmap.cell
+    # NumPy: `geometry.cell_centres` has no values while jax2onnx traces. The same, bit for bit.
+    places = (np.arange(size, dtype=np.float32) - 0.5 * (size - 1)) * cell
+    xy = np.stack(np.meshgrid(places, places), axis=-1)
     # A point that a camera at the side sees lies anywhere in its cell.
     margin = 0.5 * cfg.heightmap.cell if cfg.heightmap.view == "oblique" else 0.0
     return tray.heights(cfg.scene.tray, xy, margin)

@@ -62,7 +62,7 @@ class Toy:
         place = jax.random.permutation(key, GRID * GRID)[: len(self.kinds)]
         layout = Layout(place.astype(jnp.int32), jnp.asarray(self.kinds, jnp.int32))
         no, none, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros(())
-        info = Info(none, none, zero, zero, none, none, none, no)
+        info = Info(none, none, zero, zero, none, none, none, no, no)
         return State(layout, self.observe(layout), zero, no, no, none, none, none, info)
 
     def observe(self, layout: Layout) -> Observation:

@@ -54,10 +54,13 @@ def test_format_is_stored():
 
 
 def test_missing_and_gone_settings():
-    """Claim: a config without a setting, or a whole section, is read with the defaults; one with a
-    setting that is gone without it; JSON's 1 is 1.0 where a float is wanted."""
+    """Claim: a config without a setting, or a whole section, is read with the defaults, as is one
+    from before trays and the limit of the force; one with a setting that is gone without it; JSON's
+    1 is 1.0 where a float is wanted."""
     values = _through_text(presets.quick())
-    del values["cem"]["rounds"], values["camera"]
+    del values["cem"]["rounds"], values["camera"], values["scene"]["tray"]
+    for name in ("opening", "down_force", "approach", "pad_friction", "grip_force"):
+        del values["sim"][name]
     values["target"]["samples"] = 8
     values["learn"]["tau"] = 1
     assert configs.from_dict(values) == presets.quick().change(learn={"tau": 1.0})

@@ -90,7 +90,7 @@ UNFIT = {
     "spare": ('<geom name="palm"', SPARE, "joint 'spare' is not among 'joints' of gripper.json"),
     "reference": ('joint2="finger_high"', 'joint2="thumb"', "thumb"),
     "opening": ('pos="-0.006 0 0"', 'pos="-0.02 0 0"', "opening when closed is 14.0 mm, by "),
-    "tips": ('pos="0 0 0.030"', 'pos="0 0 0.050"', "height of the tips when closed is 20.0 mm"),
+    "tips": ('pos="0 0 0.0375"', 'pos="0 0 0.0575"', "height of the tips when closed is 20.0 mm"),
 }
 
 

@@ -47,7 +47,7 @@ def test_depth_of_the_tips(primitive: Primitive, top: float, low: float):
     z = np.asarray(plan.control[:, Z])
     assert plan.surface == pytest.approx(top)
     assert z.min() == pytest.approx(low, abs=1e-6)
-    assert plan.start[Z] == pytest.approx(max(low + SIM.approach, top + 0.01), abs=1e-6)
+    assert plan.start[Z] == pytest.approx(max(low + SIM.approach_height, top + 0.01), abs=1e-6)
     assert z[-1] == pytest.approx(float(plan.start[Z]), abs=1e-6)
 
 

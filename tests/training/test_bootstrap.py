@@ -29,7 +29,7 @@ def state(blocks: jax.Array, event: jax.Array) -> State:
     outcome = jnp.where(event == 0, jnp.int32(Outcome.NOTHING), outcome)
     moved = jnp.where(event == 1, 0.0, 2.0 * CHANGE_AREA)
     no = jnp.zeros(blocks.shape, bool)
-    info = Info(outcome, outcome, moved, zero, lifted.astype(jnp.int32), none, none, no)
+    info = Info(outcome, outcome, moved, zero, lifted.astype(jnp.int32), none, none, no, no)
     shown = Observation(colour=zero, height=blocks.astype(jnp.float32), target=no)
     over = (blocks == 0) & lifted
     return State(None, shown, zero, over, no, none, none, none, info)

@@ -24,7 +24,7 @@ def _after(outcome: jax.Array, by_gap: jax.Array) -> State:
     """States [T] after grasps that ended so, of a map that did not change."""
     zero, none = jnp.zeros(outcome.shape), jnp.zeros(outcome.shape, jnp.int32)
     no = jnp.zeros(outcome.shape, bool)
-    info = Info(outcome, by_gap, zero, zero, none, none, none, no)
+    info = Info(outcome, by_gap, zero, zero, none, none, none, no, no)
     return State(None, Observation(zero, zero, no), zero, no, no, none, none, none, info)
 
 
