@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
+from csac_jax.assets import assets
 from csac_jax.baselines import planner
 from csac_jax.constants import Primitive
 from csac_jax.evaluation import certification
 from csac_jax.evaluation.certification import Lab
-from csac_jax.scenes import constructions
-from csac_jax.world import scene_state
+from csac_jax.scenes import certify, constructions
 from csac_jax.world.scene_state import SceneState
 
 pytestmark = pytest.mark.mjx
@@ -107,13 +107,15 @@ def test_rows_are_trials_of_their_scene():
 
 
 @pytest.mark.slow
-def test_target_between_cubes_is_certified():
-    """Claim: in C MuJoCo the middle block of a square of touching ones gets a certificate, twice
-    the same."""
-    lab, target = certification.make_lab(CFG), np.int32(4)
-    scene = _scene().replace(target=target)
-    assert scene_state.is_target(scene)[target]
-    one, two = (certification.judge(lab, scene, "grid", SEED) for _ in range(2))
+def test_a_scene_that_ships_is_certified_again():
+    """Claim: in C MuJoCo a scene of the package gets a certificate, twice the same, with the stored
+    share before a push."""
+    stored = certify.load(assets() / "certified" / "enclosed-train.npz")
+    known = next(one for one in stored.kept if one.generator == "dock")
+    scene_cfg = constructions.SUITES["enclosed"]
+    lab = certification.make_lab(presets.TEN_BLOCKS.change(scene=scene_cfg, sim={"physics": "c"}))
+    one, two = (certification.judge(lab, stored.entries[known], *known[:2]) for _ in range(2))
     assert one == two
     assert one.push >= 0
     assert one.before <= 0.01 < 0.1 <= one.after
+    assert one.before == pytest.approx(known.before, abs=0.005)

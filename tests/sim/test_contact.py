@@ -113,11 +113,11 @@ def test_touching_cubes_cannot_be_grasped():
     poses = _exhaustive(0.072, 0.012, 8)
     lifts = _run(_config(9), _grid(3), poses)[-1].any(axis=1)
     assert lifts.mean() <= 0.04
-    strong = _run(_config(9, down_force=100.0), _grid(3), poses[::4])[-1].any(axis=1)
+    strong = _run(_config(9, down_force=100.0), _grid(3), poses[::3])[-1].any(axis=1)
     assert strong.mean() > 1.5 * lifts.mean()
     alone = _scene([(-0.08, 0.0), (0.08, 0.02)])
     shares = [
-        _run(_config(2, down_force=force), alone, poses[::4])[-1].any(axis=1).mean()
+        _run(_config(2, down_force=force), alone, poses[::3])[-1].any(axis=1).mean()
         for force in (20.0, 100.0)
     ]
     assert abs(shares[0] - shares[1]) < 0.06
