@@ -34,7 +34,7 @@ class Ends(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """What an episode's grip is: numbers, or arrays [...]; 0: the gripper's own."""
+    """Grip of an episode: numbers, or arrays [...]; 0: the gripper's own."""
 
     friction: Any  # sliding, of the pads
     force: Any  # N, most of the drive

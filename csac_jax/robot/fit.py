@@ -17,7 +17,7 @@ ROOM = 0.01  # m (ours), between what is grasped and each open finger
 
 
 class Fit(NamedTuple):
-    """How the hand opens over a place."""
+    """Opening of the hand over a place."""
 
     shift: Array  # [] m, of its middle along the closing
     half: Array  # [] m, half the opening

@@ -20,7 +20,7 @@ _SCENE = "scene."  # before the names of a scene's leaves in a file
 
 
 class Certificate(NamedTuple):
-    """What was measured of a candidate."""
+    """Measurements of a candidate."""
 
     generator: str  # construction or case file
     seed: int  # of the generator's key

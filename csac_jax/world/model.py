@@ -216,7 +216,7 @@ class PadFields(NamedTuple):
 
 
 class GripFields(NamedTuple):
-    """What the fingers hold by."""
+    """Friction and force of the fingers."""
 
     friction: jax.Array  # [] sliding friction of the pads
     force: jax.Array  # [2] most of the fingers' actuator, each way, in its unit
