@@ -35,7 +35,7 @@ def test_chunks_do_what_each_does(size: int):
         )
         for i in range(6):
             for name, leaf in part(keys[i], runs[i], shared).items():
-                assert_allclose(got[name][i], leaf, rtol=1e-5, err_msg=name)
+                assert_allclose(got[name][i], leaf, rtol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize(("size", "calls"), [(1, 2), (2, 6), (3, 6)])

@@ -115,7 +115,7 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
     (after, trace), (after_c, trace_c) = ran.warp, ran.c
     names = list(CASES)
     apart = np.linalg.norm(after.position - after_c.position, axis=2).max(axis=1)
-    pressed = {"touched": 5e-3, "spinning": 1e-2, "dropped": 5e-2}  # small differences grow
+    pressed = {"touched": 5e-3, "spinning": 1e-2, "dropped": 3e-2}  # small differences grow
     for name, distance in zip(names, apart, strict=True):
         assert name == "nan" or distance < pressed.get(name, 1e-4), name
     well = np.array(names) != "nan"
@@ -140,7 +140,9 @@ def test_what_was_prepared_ahead_is_used(ran: Ran, monkeypatch: pytest.MonkeyPat
         thread.submit(simulation.prepare, physics, scenes).result()
     monkeypatch.setattr(warp_action, "Batch", None)
     after, trace = jax.jit(jax.vmap(physics.run))(ran.scene, ran.joints)
-    np.testing.assert_allclose(after.position, ran.warp[0].position, atol=1e-3)
+    is_far = np.array(list(CASES)) == "exploded"  # metres away, by rounding
+    for rows, atol in ((~is_far, 1e-6), (is_far, 1e-3)):
+        np.testing.assert_allclose(after.position[rows], ran.warp[0].position[rows], atol=atol)
     np.testing.assert_array_equal(trace.touched, ran.warp[1].touched)
 
 
