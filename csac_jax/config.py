@@ -34,6 +34,8 @@ class SceneConfig(Section, section="scene"):
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
     pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
+    certified: tuple[Literal["blocked", "enclosed", "tray", "hidden"], ...] = ()
+    """Suites whose scenes for training are the pool, in place of dropped and packed ones."""
     size_jitter: Pair = number((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of sizes: boxes and arches; meshes, 0 where `sim.physics` is warp."""
     density: Pair = number((450.0, 900.0), 100.0, 3000.0)  # Densities, kg/m^3 (ours: woods).

@@ -10,7 +10,7 @@ a cap of the config's section `task`, or when physics diverges.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,7 @@ from csac_jax.grippers import Grip, Gripper
 from csac_jax.robot.primitives import Action
 from csac_jax.scenes import pool
 from csac_jax.sim import backend, outcome, physics as simulation
-from csac_jax.sim.outcome import Trace
-from csac_jax.sim.physics import Physics
+from csac_jax.sim.physics import Motion, Physics
 from csac_jax.vision import heightmap, observe, sensor
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.world import model, scene_state
@@ -46,6 +45,7 @@ class ArraySpec:
         return jnp.all((values >= self.minimum) & (values <= self.maximum))
 
 
+MAX_FAILURES = 2  # failed grasps in a row that end an episode of certified scenes
 _FINGERS, _GRIP = np.uint32(2**30), np.uint32(2**30 + 1)  # distinct from other children of a key
 _Spec: Any = ArraySpec  # stands where a pytree has an array
 
@@ -85,21 +85,6 @@ class State:
     def done(self) -> jax.Array:
         """Returns [] bool, the episode is over."""
         return self.terminated | self.truncated
-
-
-class _Motion(NamedTuple):
-    """One action as physics ran it."""
-
-    before: SceneState  # empty where it was invalid
-    after: SceneState  # without blocks that are gone; as before where undone
-    trace: Trace
-    surface: jax.Array  # [] m, see `primitives.Plan`
-    is_grasp: jax.Array  # [] bool
-    hand_rise: jax.Array  # [] m, from the lowest set-point
-    diverged: jax.Array  # [] bool, physics failed
-    blocked: jax.Array  # [] bool, a guarded descent was stopped
-    lifted: jax.Array  # [N] bool, blocks in the hand
-    lost: jax.Array  # [N] bool, blocks that left the workspace
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,10 +143,10 @@ class Env:
 
     def auto_reset(self, key: jax.Array, state: State) -> State:
         """Starts the episode after `state` in a fresh scene, or in the same scene with a new target
-        after a success in the task `target`."""
+        after a success in the task `target`; a certified scene is none any more."""
         key_scene, key_target = jax.random.split(key)
         scene = self._sample_scene(key_scene)
-        if self.cfg.task.kind == "target":
+        if self.cfg.task.kind == "target" and not self.cfg.scene.certified:
             same_scene = (state.reward > 0.0) & jnp.any(state.scene.in_play)
             scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
@@ -173,7 +158,8 @@ class Env:
         where physics diverges. A scene that was invalid before becomes empty.
         """
         before, valid = self._validate(state)
-        motion = self._move(before, valid, state.obs.height, action)
+        height = state.obs.height
+        motion = simulation.act(self.physics, self.cfg, before, height, action, valid)
         return self._judge(state, action, motion)
 
     def _validate(self, state: State) -> tuple[SceneState, jax.Array]:
@@ -185,28 +171,7 @@ class Env:
         blank = blank.replace(fingers=state.scene.fingers, grip=state.scene.grip)
         return _select(valid, state.scene, blank), valid
 
-    def _move(
-        self, before: SceneState, valid: jax.Array, height: jax.Array, action: Action
-    ) -> _Motion:
-        """Runs the primitive, or undoes it where physics diverged; takes blocks off the table."""
-        after, trace, plan = simulation.execute(self.physics, self.cfg, before, height, action)
-        finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
-        diverged = ~(valid & finite & simulation.healthy(after))
-        guarded = self.cfg.sim.approach == "guarded"
-        blocked = guarded & outcome.is_stopped(trace, action.primitive) & ~diverged
-        undone = diverged | blocked
-        after = _select(undone, before, after)
-        is_grasp = action.primitive == Primitive.GRASP
-        hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-        lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~undone
-        side = self.cfg.scene.tray or self.cfg.heightmap.extent  # over a wall, too, is lost
-        inside = scene_state.inside(after.position, side)
-        lost = after.in_play & ~inside & ~lifted
-        after = scene_state.park(after, ~lifted & ~lost)
-        judged = plan.surface, is_grasp, hand_rise, diverged, blocked, lifted, lost
-        return _Motion(before, after, trace, *judged)
-
-    def _judge(self, state: State, action: Action, motion: _Motion) -> State:
+    def _judge(self, state: State, action: Action, motion: Motion) -> State:
         """Observes the scene that is left; counts actions, rewards and ends the episode."""
         scene, actions = motion.after, state.actions + 1
         obs = self._observe(scene, state.noise_key, actions)
@@ -287,10 +252,11 @@ def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | Non
     """
     cfg = backend.resolve(cfg)
     physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    return Env(cfg, physics, pool.scenes(cfg, stream, num_scenes))
+    max_failures = MAX_FAILURES if cfg.scene.certified else 0
+    return Env(cfg, physics, pool.scenes(cfg, stream, num_scenes), max_failures=max_failures)
 
 
-def _info(action: Action, motion: _Motion, success: jax.Array, moved: jax.Array) -> Info:
+def _info(action: Action, motion: Motion, success: jax.Array, moved: jax.Array) -> Info:
     """Judges one action that `moved` [] cm^2; a `success` [] bool lifted a wanted block."""
     lifted = motion.lifted
     distance = jnp.linalg.norm(motion.before.position[:, :2] - action.pose[:2], axis=1)

@@ -131,8 +131,8 @@ def lifting_after(
 
 def _grasp_scores(tried: Trials) -> Array:
     wanted, lost = jnp.sum(tried.wanted, axis=1), jnp.sum(tried.lost, axis=1)
-    grip = jnp.max(jnp.where(tried.wanted, tried.grip, 0.0), axis=1)  # at most 1
-    return 100.0 * (wanted > 0) + 2.0 * (wanted - 2 * lost).astype(jnp.float32) + grip
+    share = jnp.max(jnp.where(tried.wanted, tried.share, 0.0), axis=1)  # at most 1
+    return 100.0 * (wanted > 0) + 2.0 * (wanted - 2 * lost).astype(jnp.float32) + share
 
 
 def _push_scores(pushed: Trials, counts: Array) -> Array:

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from csac_jax.config import Config
-from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
-from csac_jax.sim import outcome, physics as simulation
+from csac_jax.sim import physics as simulation
 from csac_jax.sim.physics import Physics
 from csac_jax.vision import observe
 from csac_jax.world import scene_state
@@ -24,7 +23,7 @@ class Trials(NamedTuple):
     scene: SceneState  # [K, N, ...] afterwards, without the blocks that were lifted or lost
     lifted: Array  # [K, N] bool, blocks in the hand, as the environment judges
     lost: Array  # [K, N] bool, blocks that left the workspace
-    grip: Array  # [K, N] rise of a lifted block over the hand's, at most 1; else 0
+    share: Array  # [K, N] rise of a lifted block over the hand's, at most 1; else 0
     motion: Array  # [K] m, the way of all blocks that are left
 
     @property
@@ -52,17 +51,9 @@ def trial(
     cfg: Config, physics: Physics, scene: SceneState, height: Array, action: Action
 ) -> Trials:
     """Simulates one action; returns leaves without the axis [K]."""
-    after, trace, plan = simulation.execute(physics, cfg, scene, height, action)
-    guarded = cfg.sim.approach == "guarded"
-    sound = simulation.healthy(after) & ~(guarded & outcome.is_stopped(trace, action.primitive))
-    after = jax.tree.map(functools.partial(jnp.where, sound), after, scene)
-    hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
-    is_grasp = action.primitive == Primitive.GRASP
-    lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & sound
-    inside = scene_state.inside(after.position, cfg.scene.tray or cfg.heightmap.extent)
-    lost = after.in_play & ~inside & ~lifted
-    left = scene_state.park(after, ~lifted & ~lost)
+    motion = simulation.act(physics, cfg, scene, height, action)
+    left, lifted = motion.after, motion.lifted
     way = jnp.linalg.norm(left.position - scene.position, axis=1)
-    share = jnp.clip(trace.rise / jnp.maximum(hand_rise, 1e-3), 0.0, 1.0)
-    grip = jnp.where(lifted, share, 0.0)
-    return Trials(left, lifted, lost, grip, jnp.sum(jnp.where(left.in_play, way, 0.0)))
+    share = jnp.clip(motion.trace.rise / jnp.maximum(motion.hand_rise, 1e-3), 0.0, 1.0)
+    way = jnp.sum(jnp.where(left.in_play, way, 0.0))
+    return Trials(left, lifted, motion.lost, jnp.where(lifted, share, 0.0), way)

@@ -51,10 +51,10 @@ def run(arguments: list[str]) -> int:
 def _certify(options: CertifyOptions) -> int:
     _check(options)
     from csac_jax.evaluation import certification
-    from csac_jax.scenes import certify
+    from csac_jax.scenes import certify, constructions
 
     scene_cfg, candidates = _candidates(options)
-    base = presets.TEN_BLOCKS.change(scene=scene_cfg, sim={"physics": "c"})
+    base = presets.TEN_BLOCKS.change(scene=scene_cfg, sim={"physics": "c", **constructions.SIM})
     cfgs = [base]
     if options.physics == "warp":  # whose meshes have one size
         alike = {"size_jitter": (base.scene.size_jitter[0], 0.0)}

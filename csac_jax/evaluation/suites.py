@@ -39,7 +39,6 @@ import jax
 import numpy as np
 
 from csac_jax import env as environment, grippers
-from csac_jax.assets import assets
 from csac_jax.config import (
     Config,
     PhysicsKind,
@@ -51,7 +50,7 @@ from csac_jax.config import (
     SlotKind,
 )
 from csac_jax.constants import RENAMED_SUITES
-from csac_jax.env import Env
+from csac_jax.env import MAX_FAILURES, Env
 from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
 from csac_jax.scenes import arrange, cases, certify, constructions, pool
@@ -68,7 +67,6 @@ TEN: tuple[SlotKind, ...] = (  # blocks of random10, of all kinds
 TEN_CONTACTS = SimConfig(geom_pairs=24, contacts=80)
 TARGET = {"kind": "target", "max_actions": 5}  # CSAC sec. 4.4
 FEW = 5  # objects of `pile` and `objects_packed` (VGN, arXiv:2101.01132)
-MAX_FAILURES = 2  # failed grasps in a row that end an episode there (VGN)
 ACTIONS_EACH = 5  # most actions for each object (ours): pushes do not count as failures
 TIGHT = (0.6, 0.95)  # middle side of an object of `tight` over the hand's opening
 HIDDEN = {"kind": "target", "max_actions": 10}  # ours: a search takes longer
@@ -274,8 +272,8 @@ def _pushes(suite: str, cfg: Config, *_: int) -> Env:
     """Builds a suite whose scenes need pushes; 2.5 actions for each block or more, as dropped."""
     scene = constructions.SUITES[suite]
     actions = max(cfg.task.max_actions, len(scene.slots) * 5 // 2)
-    cfg = _wide(cfg, scene).change(task={"max_actions": actions})
-    certified = certify.load(assets() / "certified" / f"{suite}.npz")
+    cfg = _wide(cfg, scene).change(sim=constructions.SIM, task={"max_actions": actions})
+    certified = certify.load(certify.shipped(suite))
     return _env(cfg, certified.scenes, MAX_FAILURES)
 
 

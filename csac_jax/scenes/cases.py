@@ -68,15 +68,22 @@ def require_target(case: Case) -> None:
 
 
 def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:
-    """Moves a case to other slots: each block to the first free one of its kind."""
+    """Moves the blocks in play of a case to other slots: each to the first free one of its kind.
+
+    Raises SettingsError where there is none.
+    """
+    used = np.flatnonzero(case.scene.in_play)
     places = {kind: [i for i, other in enumerate(slots) if other == kind] for kind in case.slots}
-    seats = [places[kind].pop(0) for kind in case.slots]
+    for kind, free in places.items():
+        if (count := [case.slots[i] for i in used].count(kind)) > len(free):
+            raise SettingsError(f"scene.slots: {case.name} needs {count} of kind {kind}")
+    seats = {int(i): places[case.slots[i]].pop(0) for i in used}
 
     def put(parked: np.ndarray, placed: np.ndarray) -> Any:
-        if parked.ndim == 0:
-            return placed if placed == scene_state.ANY else np.int32(seats[placed])  # the target
+        if parked.ndim == 0:  # the target
+            return placed if placed == scene_state.ANY else np.int32(seats[int(placed)])
         leaf = parked.copy()
-        leaf[seats] = placed
+        leaf[list(seats.values())] = placed[used]
         return leaf
 
     return jax.tree.map(put, scene_state.parked(slots), case.scene)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from csac_jax.assets import assets
 from csac_jax.errors import SettingsError
 from csac_jax.world.scene_state import SceneState
 
@@ -66,6 +67,11 @@ def encode(certified: CertifiedScenes) -> bytes:
         arrays |= {_SCENE + name: leaf for name, leaf in _leaves(certified.scenes).items()}
     np.savez_compressed(buffer := io.BytesIO(), **arrays)
     return buffer.getvalue()
+
+
+def shipped(name: str) -> Path:
+    """Returns the path of a file of the package, of a suite or, with -train, for training."""
+    return assets() / "certified" / f"{name}.npz"
 
 
 def load(path: Path) -> CertifiedScenes:

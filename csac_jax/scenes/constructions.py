@@ -2,12 +2,14 @@
 
 Those that train and those that test share none. Blocks touch, and none offers two opposite free
 sides within OPENING: it is longer, or a neighbour, a wall or a roof covers one of them. Sizes,
-gaps, colours and materials vary, and the whole is turned. Scenes are drawn on the host, by NumPy.
+gaps, colours and materials vary, and the whole is turned. The pads have the friction of rubber on
+wood: with more than 1, two pads would lift a block by a free corner. Scenes are drawn on the host,
+by NumPy.
 """
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -17,14 +19,16 @@ from csac_jax.world import blocks, scene_state
 from csac_jax.world.scene_state import SceneState
 
 OPENING = 0.110  # m, of the RG2, for which the sizes are made
+CYLINDER = (0.0448, 0.0448, 0.05)  # m, whole sides
 TRAY = 0.30  # m, inner side of the tray
 SUITES: dict[str, SceneConfig] = {
-    "blocked": SceneConfig(slots=("box",) * 9 + ("arch",) * 3, min_blocks=1),
-    "enclosed": SceneConfig(slots=("box",) * 9 + ("cylinder",), min_blocks=1),
-    "tray": SceneConfig(slots=("box",) * 5 + ("arch",), min_blocks=1, tray=TRAY),
+    "blocked": SceneConfig(slots=("box",) * 4 + ("arch",) * 2, min_blocks=1),
+    "enclosed": SceneConfig(slots=("box",) * 5 + ("cylinder",), min_blocks=1),
+    "tray": SceneConfig(slots=("box",) * 4 + ("arch",), min_blocks=1, tray=TRAY),
     "hidden": SceneConfig(slots=("box",) * 6, min_blocks=1),
 }
 """Slots of the scenes of each suite; those that a scene has no use for are parked."""
+SIM: dict[str, Any] = {"pad_friction": (0.8, 0.8)}  # settings of section sim in these suites
 WITH_TARGET = ("enclosed", "hidden")  # suites whose scenes mark a target
 _LONG = (0.114, 0.124)  # m, longer than the opening
 _GAP = 0.001  # m, widest between neighbours: each block is smaller by a random part of it
@@ -119,17 +123,17 @@ def _middles(widths: list[float]) -> list[float]:
 
 
 def _bars(draw: _Draw) -> list[Laid]:
-    """Lays four to six bars longer than the opening side by side."""
-    widths, high = draw.many(int(draw.rng.integers(4, 7)), 0.030, 0.045), draw(0.035, 0.050)
+    """Lays three or four bars longer than the opening side by side."""
+    widths, high = draw.many(int(draw.rng.integers(3, 5)), 0.038, 0.048), draw(0.035, 0.050)
     row = zip(_middles(widths), widths, strict=True)
     return [Laid((0.0, y), (draw.long(), width, high)) for y, width in row]
 
 
 def _grid(draw: _Draw) -> list[Laid]:
-    """Lays three rows of three blocks."""
-    columns, rows, high = draw.many(3, 0.05, 0.062), draw.many(3, 0.05, 0.062), draw(0.035, 0.05)
+    """Lays two rows of two blocks, two of which are wider than the opening."""
+    columns, rows, high = draw.many(2, 0.060, 0.068), draw.many(2, 0.060, 0.068), draw(0.035, 0.05)
     xs, ys = _middles(columns), _middles(rows)
-    return [Laid((xs[i], ys[j]), (columns[i], rows[j], high)) for i in range(3) for j in range(3)]
+    return [Laid((xs[i], ys[j]), (columns[i], rows[j], high)) for i in range(2) for j in range(2)]
 
 
 def _slabs(draw: _Draw) -> list[Laid]:
@@ -140,44 +144,39 @@ def _slabs(draw: _Draw) -> list[Laid]:
 
 
 def _arcade(draw: _Draw) -> list[Laid]:
-    """Lays three arches longer than the opening tunnel to tunnel, between two bars."""
-    kinds: tuple[SlotKind, ...] = ("box", "arch", "arch", "arch", "box")
-    widths, high = draw.many(5, 0.035, 0.055), draw(0.045, 0.055)
+    """Lays two arches longer than the opening tunnel to tunnel, between two bars."""
+    kinds: tuple[SlotKind, ...] = ("box", "arch", "arch", "box")
+    widths, high = draw.many(4, 0.035, 0.050), draw(0.045, 0.055)
     row = zip(_middles(widths), widths, kinds, strict=True)
     return [Laid((0.0, y), (draw.long(), width, high), kind=kind) for y, width, kind in row]
 
 
 def _parquet(draw: _Draw) -> list[Laid]:
-    """Lays four pairs of bars, each pair across its neighbours."""
+    """Lays a pair of bars across the end of another pair."""
     length, high, pieces = draw.long(), draw(0.035, 0.050), []
-    for number, (x, y) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
+    for across in (False, True):
         share = draw(0.45, 0.55)
         for way, part in ((-0.5, share), (0.5, 1.0 - share)):
-            aside, along = way * (1.0 - part) * length, 0.5 * length
-            middle, size = (x * along, y * along + aside), (length, part * length, high)
-            if number % 2:
-                middle, size = (x * along + aside, y * along), (part * length, length, high)
+            aside = way * (1.0 - part) * length
+            middle, size = (0.0, aside), (length, part * length, high)
+            if across:
+                middle, size = (length + aside, 0.0), (part * length, length, high)
             pieces.append(Laid(middle, size))
     return pieces
 
 
-def _steps(draw: _Draw) -> list[Laid]:
-    """Lays five bars like steps: each begins farther along than the one before."""
-    widths, high, slant = draw.many(5, 0.034, 0.048), draw(0.035, 0.050), draw(0.010, 0.022)
-    row = enumerate(zip(_middles(widths), widths, strict=True))
-    return [Laid((i * slant, y), (draw.long(), width, high)) for i, (y, width) in row]
-
-
-def _around(side: float, sizes: list[tuple[float, float]], high: float) -> list[Laid]:
-    """Places four blocks round a square of `side` m, each flush with the inside of the next.
-
-    Args: sizes, away from the square and along it, m.
-    """
-    pieces = []
-    for (x, y), (wide, long) in zip(_SIDES, sizes, strict=True):
-        out, along = 0.5 * (side + wide), 0.5 * (long - side)
-        lying = (long, wide) if y else (wide, long)
-        pieces.append(Laid((x * out + y * along, y * out - x * along), (*lying, high)))
+def _crib(draw: _Draw) -> list[Laid]:
+    """Lays two slabs together and two more across them; no pair is within the opening."""
+    pieces, floor = [], 0.0
+    for across in (False, True):
+        widths, high = draw.many(2, 0.058, 0.066), draw(0.028, 0.040)
+        for y, width in zip(_middles(widths), widths, strict=True):
+            aside, long = y - 0.5 * sum(widths), draw.long()
+            middle, size = (0.0, aside), (long, width, high)
+            if across:
+                middle, size = (aside, 0.0), (width, long, high)
+            pieces.append(Laid(middle, size, floor=floor))
+        floor = high
     return pieces
 
 
@@ -203,46 +202,46 @@ def _dock(draw: _Draw) -> list[Laid]:
     return [*pieces, Laid((behind, aside), (back, width + sum(arms), high))]
 
 
-def _courtyard(draw: _Draw) -> list[Laid]:
-    """Puts a low block or a cylinder between four high ones whose sides exceed the opening."""
-    side, high = draw(0.046, 0.054), draw(0.052, 0.070)
-    target = Laid((0.0, 0.0), (side, side, draw(0.030, 0.045)))
-    if draw(0.0, 1.0) < 0.4:
-        target = Laid((0.0, 0.0), (0.0448, 0.0448, 0.05), kind="cylinder", exact=True)
-    return [target, *_around(side, [(draw.long(), draw.long()) for _ in _SIDES], high)]
+def _alcove(draw: _Draw) -> list[Laid]:
+    """Puts a low block into a U of three high ones; with the one behind it exceeds the opening."""
+    (x, y), (low, high) = draw.many(2, 0.048, 0.052), (draw(0.030, 0.045), draw(0.052, 0.070))
+    deep, behind = draw(0.064, 0.070), draw(0.056, 0.075)
+    pieces = [Laid((0.0, 0.0), (x, y, low)), Laid((-0.5 * (x + deep), 0.0), (deep, behind, high))]
+    for way in (-0.5, 0.5):
+        wide, long = draw(0.036, 0.050), draw.long()
+        pieces.append(Laid((0.5 * (long - x), way * (y + wide)), (long, wide, high)))
+    return pieces
 
 
 def _pinwheel(draw: _Draw) -> list[Laid]:
-    """Encloses a block by four bars; each ends at the side of the next."""
-    side, wide, high = draw(0.048, 0.058), draw(0.062, 0.066), draw(0.035, 0.050)
-    ring = _around(side, [(wide, wide + side)] * 4, high)
-    return [Laid((0.0, 0.0), (side, side, high)), *ring]
-
-
-def _rings(draw: _Draw) -> list[Laid]:
-    """Encloses a narrow block by two rings of four bars."""
-    side, high, (inner, outer) = draw(0.028, 0.032), draw(0.035, 0.050), draw.many(2, 0.028, 0.030)
-    across = side + 2.0 * inner
-    rings = _around(side, [(inner, inner + side)] * 4, high)
-    rings += _around(across, [(outer, outer + across)] * 4, high)
-    return [Laid((0.0, 0.0), (side, side, high)), *rings]
+    """Puts three bars round a block or a cylinder; two of them end at the side of the next."""
+    side, wide, high = draw(0.048, 0.058), draw(0.064, 0.068), draw(0.035, 0.050)
+    pieces = [Laid((0.0, 0.0), (side, side, high))]
+    if draw(0.0, 1.0) < 0.4:
+        side, wide, high = CYLINDER[0], wide + 0.004, CYLINDER[2]
+        pieces = [Laid((0.0, 0.0), CYLINDER, kind="cylinder", exact=True)]
+    out, along = 0.5 * (side + wide), 0.5 * wide
+    for x, y in _SIDES[:3]:
+        size = (side + wide, wide) if y else (wide, side + wide)
+        pieces.append(Laid((x * out + y * along, y * out - x * along), (*size, high)))
+    return pieces
 
 
 def _corners(draw: _Draw) -> list[Laid]:
-    """Puts a block into each of two to four corners of the tray."""
-    pieces, count = [], int(draw.rng.integers(2, 5))
-    for x, y in ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, 0.5))[:count]:
-        wide, long = draw.many(2, 0.045, 0.085)
+    """Puts a block into each of two or three corners of the tray."""
+    pieces, count = [], int(draw.rng.integers(2, 4))
+    for x, y in ((-0.5, -0.5), (0.5, 0.5), (0.5, -0.5))[:count]:
+        wide, long = draw.many(2, 0.040, 0.070)
         middle = x * (TRAY - wide), y * (TRAY - long)
         pieces.append(Laid(middle, (wide, long, draw(0.030, 0.050))))
     return pieces
 
 
 def _moored(draw: _Draw) -> list[Laid]:
-    """Puts two to four blocks longer than the opening along the walls of the tray."""
-    kinds: tuple[SlotKind, ...] = ("box", "arch", "box", "box")
-    pieces, count = [], int(draw.rng.integers(2, 5))
-    for (x, y), kind in list(zip(_SIDES, kinds, strict=True))[:count]:
+    """Puts two or three blocks longer than the opening along the walls of the tray."""
+    kinds: tuple[SlotKind, ...] = ("box", "arch", "box")
+    pieces, count = [], int(draw.rng.integers(2, 4))
+    for (x, y), kind in list(zip(_SIDES, kinds, strict=False))[:count]:
         wide, long, aside = draw(0.035, 0.055), draw.long(), draw(-0.03, 0.03)
         size = (long, wide) if y else (wide, long)
         out = 0.5 * (TRAY - wide)
@@ -251,12 +250,14 @@ def _moored(draw: _Draw) -> list[Laid]:
     return pieces
 
 
-def _shelf(draw: _Draw) -> list[Laid]:
-    """Fills one side of the tray, from wall to wall, with five blocks of one depth."""
-    parts, deep, high = draw.many(5, 0.9, 1.1), draw(0.045, 0.065), draw(0.035, 0.050)
-    widths, y = [TRAY * part / sum(parts) for part in parts], 0.5 * (TRAY - deep)
-    row = zip(_middles(widths), widths, strict=True)
-    return [Laid((x - 0.5 * TRAY, y), (width, deep, high)) for x, width in row]
+def _berth(draw: _Draw) -> list[Laid]:
+    """Lays a slab along a wall of the tray and one beside it; together they exceed the opening."""
+    pieces, y, aside, high = [], 0.5 * TRAY, draw(-0.05, 0.05), draw(0.035, 0.050)
+    for deep in draw.many(2, 0.057, 0.064):
+        x = aside + draw(-0.004, 0.004)
+        pieces.append(Laid((x, y - 0.5 * deep), (draw.long(), deep, high)))
+        y -= deep
+    return pieces
 
 
 def _nook(draw: _Draw) -> list[Laid]:
@@ -308,18 +309,6 @@ def _shed(draw: _Draw) -> list[Laid]:
     ]
 
 
-def _vault(draw: _Draw) -> list[Laid]:
-    """Puts a bar between two piers whose sides exceed the opening, and a plate over the three."""
-    wide, long, low = draw(0.036, 0.050), draw.long(), draw(0.025, 0.040)
-    high, share = low + draw(0.0, 0.004), min(_seen(draw), 0.4)  # beyond, the plate would fall
-    pieces = [Laid((0.0, 0.0), (wide, long, low))]
-    for way in (-0.5, 0.5):
-        pier = draw.long()
-        pieces.append(Laid((way * (wide + pier), draw(-0.003, 0.003)), (pier, long, high)))
-    plate = draw.long(), long, draw(0.012, 0.020)
-    return [*pieces, Laid((0.0, share * long), plate, floor=high, exact=True)]
-
-
 def _constructions(**places: tuple[str, Place]) -> dict[str, Construction]:
     return {
         name: Construction(suite, functools.partial(make, suite, place))
@@ -334,7 +323,7 @@ TRAIN = _constructions(
     arcade=("blocked", _arcade),
     frame=("enclosed", _frame),
     dock=("enclosed", _dock),
-    courtyard=("enclosed", _courtyard),
+    alcove=("enclosed", _alcove),
     corners=("tray", _corners),
     moored=("tray", _moored),
     roof=("hidden", _roof),
@@ -342,12 +331,10 @@ TRAIN = _constructions(
 """Constructions that training and tuning may use, by name."""
 TEST = _constructions(
     parquet=("blocked", _parquet),
-    steps=("blocked", _steps),
+    crib=("blocked", _crib),
     pinwheel=("enclosed", _pinwheel),
-    rings=("enclosed", _rings),
-    shelf=("tray", _shelf),
+    berth=("tray", _berth),
     nook=("tray", _nook),
     shed=("hidden", _shed),
-    vault=("hidden", _vault),
 )
 """Constructions of the suites, by name; no policy is trained on them."""

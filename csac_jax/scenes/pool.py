@@ -24,8 +24,8 @@ import numpy as np
 from csac_jax import cache_folder
 from csac_jax.assets import assets
 from csac_jax.config import Config, SceneConfig
-from csac_jax.errors import SceneError
-from csac_jax.scenes import arrange, packings
+from csac_jax.errors import SceneError, SettingsError
+from csac_jax.scenes import arrange, cases, certify, constructions, packings
 from csac_jax.world import blocks, model, object_slots, scene_state
 from csac_jax.world.model import BlockFields, World
 from csac_jax.world.scene_state import SceneState
@@ -51,8 +51,11 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
 
     The last `scene.packed_fraction` of them are arrangements, or objects side by side in the
     largest square of `scene.drop_extent`. Without a count, `scene.pool` of each number of blocks.
+    With `scene.certified` all certified scenes for training of these suites, whatever the count.
     Raises SceneError for blocks that do not come to rest or allow no arrangement.
     """
+    if cfg.scene.certified:
+        return _certified(cfg.scene)
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     number = cfg.scene.pool if count is None else -(-count // block_counts)
     arranged = round(cfg.scene.packed_fraction * number)
@@ -65,6 +68,22 @@ def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
         name = _digest(cfg, stream, drawn[-1], "arranged")
         parts.append(_stored(name, lambda: arrange.arrangements(*drawn)))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _certified(cfg: SceneConfig) -> SceneState:
+    """Returns the certified scenes for training of the suites, [P, N, ...], in the config's slots.
+
+    Raises SettingsError where slots or tray do not fit.
+    """
+    seated = []
+    for name in cfg.certified:
+        suite = constructions.SUITES[name]
+        if suite.tray != cfg.tray:
+            raise SettingsError(f"scene.tray: scenes of {name} need {suite.tray:g}")
+        scenes = certify.load(certify.shipped(f"{name}-train")).scenes
+        rows = [jax.tree.map(lambda leaf, i=i: leaf[i], scenes) for i in range(len(scenes.target))]
+        seated += [cases.seat(cases.Case(name, suite.slots, row), cfg.slots) for row in rows]
+    return _stack(seated)
 
 
 def settled(
@@ -286,7 +305,8 @@ def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=object_slots.library(scene).sha256)
-    settings = repr((_VERSION, mujoco.__version__, repr(scene), *numbers, *how))
+    drawn = {name: value for name, value in vars(scene).items() if name != "certified"}
+    settings = repr((_VERSION, mujoco.__version__, drawn, *numbers, *how))
     content = hashlib.sha256(settings.encode())
     code = [arrange.__file__, packings.__file__] if "arranged" in how else []
     for path in ("table.xml", "grippers/rg2/gripper.xml", "blocks.xml", *code):

@@ -2,16 +2,17 @@
 
 import functools
 from collections.abc import Callable
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
 from csac_jax.config import Config, SimConfig
+from csac_jax.constants import Primitive
 from csac_jax.errors import SettingsError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action, JointTrajectory, Plan
-from csac_jax.sim import c_physics, warp_physics
+from csac_jax.sim import c_physics, outcome, warp_physics
 from csac_jax.sim.outcome import Trace
 from csac_jax.world import blocks, scene_state
 from csac_jax.world.model import World
@@ -23,6 +24,21 @@ class Physics(Protocol):
 
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Moves the robot, one set-point per substep; blocks out of play stay. Callers vmap."""
+
+
+class Motion(NamedTuple):
+    """One action as physics ran it. N = block slots."""
+
+    before: SceneState
+    after: SceneState  # without blocks that are gone; as before where undone
+    trace: Trace
+    surface: jax.Array  # [] m, see `primitives.Plan`
+    is_grasp: jax.Array  # [] bool
+    hand_rise: jax.Array  # [] m, from the lowest set-point
+    diverged: jax.Array  # [] bool, physics failed, or the inputs were void
+    blocked: jax.Array  # [] bool, undone: a guarded descent was stopped
+    lifted: jax.Array  # [N] bool, blocks in the hand
+    lost: jax.Array  # [N] bool, blocks that left the workspace
 
 
 def _make_mjx(world: World, cfg: SimConfig) -> Physics:
@@ -64,6 +80,33 @@ def execute(
     choose = functools.partial(jnp.where, joints.reachable)
     after, trace = jax.tree.map(choose, (after, trace), unmoved)
     return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
+
+
+def act(
+    physics: Physics,
+    cfg: Config,
+    scene: SceneState,
+    height: jax.Array,
+    action: Action,
+    valid: jax.Array | bool = True,
+) -> Motion:
+    """Runs a primitive, as `execute`, and takes lifted and lost blocks off the table. Undoes one
+    that is not `valid` [] bool, that diverges or that is blocked."""
+    after, trace, plan = execute(physics, cfg, scene, height, action)
+    finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
+    diverged = ~(valid & finite & healthy(after))
+    guarded = cfg.sim.approach == "guarded"
+    blocked = guarded & outcome.is_stopped(trace, action.primitive) & ~diverged
+    undone = diverged | blocked
+    after = jax.tree.map(functools.partial(jnp.where, undone), scene, after)
+    is_grasp = action.primitive == Primitive.GRASP
+    hand_rise = plan.start[2] - jnp.min(plan.control[:, 2])
+    lifted = outcome.lifted_blocks(trace, hand_rise) & is_grasp & ~undone
+    side = cfg.scene.tray or cfg.heightmap.extent  # over a wall, too, is lost
+    lost = after.in_play & ~scene_state.inside(after.position, side) & ~lifted
+    after = scene_state.park(after, ~lifted & ~lost)
+    judged = plan.surface, is_grasp, hand_rise, diverged, blocked, lifted, lost
+    return Motion(scene, after, trace, *judged)
 
 
 def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:

@@ -56,6 +56,47 @@ def test_first_good_push_is_recorded(rows: int):
     assert round(100 * certificate.after, 6) % 1 == 0
 
 
+class TwoSides(Toy):
+    """As Toy, but a push to the right, too, opens the scene; one to the left moves one block."""
+
+    def trial(self, scenes, heights, actions):
+        wanted, lost, after = super().trial(scenes, heights, actions)
+        poses = np.asarray(actions.pose)
+        right = (np.asarray(actions.primitive) == Primitive.PUSH) & (np.cos(poses[:, 2]) > 0.9)
+        friction = np.where(right[:, None], np.float32(OPENED), after.friction)
+        position = after.position + 0.0
+        position[right, :, 0] += 0.1  # all blocks alike
+        position[after.friction[:, 0] == OPENED, 0, 0] -= 0.05
+        return wanted, lost, after.replace(friction=friction, position=position)
+
+
+def test_pushes_that_part_blocks_come_first():
+    """Claim: of pushes that open a scene, one that moves a block from the others is recorded before
+    one that moves all alike."""
+    certificate = certification.judge(TwoSides().lab(), _scene(), "grid", SEED)
+    pushes = planner.sample_pushes(jax.random.key(SEED), CFG, _scene(), certification.PUSHES)
+    right = np.flatnonzero(np.cos(pushes.pose[:, 2]) > 0.9)
+    assert certificate.push == np.flatnonzero(np.cos(pushes.pose[:, 2]) < -0.9)[0]
+    assert right[0] < certificate.push
+
+
+def test_pads_have_the_friction_of_these_scenes():
+    """Claim: the grip of a certificate is the config's; scenes are handed on without it."""
+    one, two = (
+        certification.make_lab(CFG.change(sim={"pad_friction": (value, value)}))
+        for value in (0.01, 1.0)
+    )
+    scene = _scene()
+    alone = scene.replace(in_play=scene.in_play & (np.cumsum(scene.in_play) == 1))
+    here, wide = alone.position[alone.in_play][0], alone.quaternion[alone.in_play][0]
+    yaw = 2.0 * np.arctan2(wide[3], wide[0])
+    grasp = np.float32([[here[0], here[1], yaw]])
+    (slips, _, after), *_ = certification._batches(one, [(alone, grasp)])
+    (holds, _, _), *_ = certification._batches(two, [(alone, grasp)])
+    assert (slips[0], holds[0]) == (False, True)
+    assert after.grip is None
+
+
 def test_scene_that_is_easy_is_refused_at_once():
     """Claim: a scene is refused as soon as more than 1 % of its grasps are sure to lift."""
     toy = Toy(lifts_before=True)
@@ -113,7 +154,7 @@ def test_a_scene_that_ships_is_certified_again():
     stored = certify.load(assets() / "certified" / "enclosed-train.npz")
     known = next(one for one in stored.kept if one.generator == "dock")
     scene_cfg = constructions.SUITES["enclosed"]
-    lab = certification.make_lab(presets.TEN_BLOCKS.change(scene=scene_cfg, sim={"physics": "c"}))
+    lab = certification.make_lab(CFG.change(scene=scene_cfg, sim=constructions.SIM))
     one, two = (certification.judge(lab, stored.entries[known], *known[:2]) for _ in range(2))
     assert one == two
     assert one.push >= 0

@@ -12,7 +12,6 @@ import pytest
 
 from csac_jax import grippers, presets
 from csac_jax.agent import maps
-from csac_jax.assets import assets
 from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.errors import SceneError
@@ -49,16 +48,17 @@ def test_suite_is_built_and_rolls_out(suite: str):
     policy and end after two failed grasps in a row."""
     parts = _parts(suite)
     assert set(parts) <= (set(suites.SEEN) if suite == "hidden" else {suite})
-    certified = certify.load(assets() / "certified" / f"{suite}.npz")
+    certified = certify.load(certify.shipped(suite))
     assert {constructions.TEST[one.generator].suite for one in certified.kept} == {suite}
     rows = sum(len(env.scenes.target) for env in parts.values())
     assert rows == len(certified.kept) if suite != "hidden" else 10 < rows <= len(certified.kept)
     for env in parts.values():
         assert env.cfg.scene == constructions.SUITES[suite]
         assert env.max_failures == 2
+        assert env.cfg.sim.pad_friction == (0.8, 0.8)
         wanted = {"enclosed": ("target", 5), "hidden": ("target", 10)}.get(suite, ("clear", 15))
         assert env.cfg.task.kind == wanted[0]
-        assert env.cfg.task.max_actions == max(wanted[1], suite == "blocked" and 30)
+        assert env.cfg.task.max_actions == max(wanted[1], 15 if suite == "tray" else 0)
     env = next(iter(parts.values()))
     episodes = rollout.rollout(env, policies.RandomPolicy(env.cfg), 2, seed=0)
     assert episodes.valid[:, 0].all()

@@ -12,8 +12,9 @@ from scipy import stats
 
 from csac_jax import presets
 from csac_jax.config import Config, SceneConfig, SimConfig
-from csac_jax.errors import SceneError
-from csac_jax.scenes import arrange, pool
+from csac_jax.env import MAX_FAILURES, make_env
+from csac_jax.errors import SceneError, SettingsError
+from csac_jax.scenes import arrange, certify, constructions, pool
 from csac_jax.world import blocks, model, scene_state
 from csac_jax.world.scene_state import SceneState, parking
 from tests.world import placed
@@ -269,3 +270,36 @@ def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest
     for name in ("half_size", "density", "friction", "colour"):
         ours, theirs = (getattr(each, name)[:20][fits] for each in (settled, shipped))
         np.testing.assert_array_equal(ours, theirs)
+
+
+def test_certified_scenes_are_the_pool():
+    """Claim: with `scene.certified` the pool is every certified scene for training, its blocks in
+    slots of their kind, its target among them; the task goes on in another scene."""
+    scene = {"slots": ("cylinder", "arch", *("box",) * 6), "certified": ("enclosed",)}
+    cfg = presets.get("pushes").change(scene=scene, sim={"physics": "c"})
+    drawn = pool.scenes(cfg, pool.TRAIN_STREAM, 1)
+    stored = certify.load(certify.shipped("enclosed-train")).scenes
+    np.testing.assert_array_equal(drawn.in_play.sum(axis=1), stored.in_play.sum(axis=1))
+    rows = np.arange(len(stored.target))
+    for leaf in ("position", "half_size", "friction"):
+        one, two = (getattr(s, leaf)[rows, s.target] for s in (drawn, stored))
+        np.testing.assert_array_equal(one, two)
+    kinds = np.array(cfg.scene.slots)
+    from_kinds = np.array(constructions.SUITES["enclosed"].slots)
+    assert list(kinds[drawn.target]) == list(from_kinds[stored.target])
+    assert make_env(cfg).max_failures == MAX_FAILURES
+
+
+@pytest.mark.parametrize(
+    ("scene", "line"),
+    [
+        ({"slots": ("box",) * 3}, r"scene\.slots: enclosed needs [45] of kind box"),
+        ({"tray": 0.3}, r"scene\.tray: scenes of enclosed need 0$"),
+        ({"certified": ("tray",)}, r"scene\.tray: scenes of tray need 0\.3$"),
+    ],
+)
+def test_certified_scenes_that_do_not_fit(scene: dict, line: str):
+    """Claim: slots or a tray that certified scenes do not fit are a one-line error."""
+    cfg = presets.get("pushes").change(scene=scene | {"drop_extent": (0.1, 0.2)})
+    with pytest.raises(SettingsError, match=line):
+        pool.scenes(cfg, pool.TRAIN_STREAM)
