@@ -90,7 +90,7 @@ def pushes() -> Config:
     learns to clear scenes of which no grasp lifts a block. The discount is that of VPG: a push
     earns by the grasp after it.
     """
-    slots = {"slots": ("box",) * 6 + ("arch",) * 2 + ("cylinder",), "min_blocks": 1}
+    slots = {"slots": ("box",) * 6 + ("arch",) * 2, "min_blocks": 1}
     return fast().change(
         preset="pushes",
         scene={**slots, "certified": ("enclosed",), "packed_fraction": 0.0},

@@ -19,11 +19,10 @@ from csac_jax.world import blocks, scene_state
 from csac_jax.world.scene_state import SceneState
 
 OPENING = 0.110  # m, of the RG2, for which the sizes are made
-CYLINDER = (0.0448, 0.0448, 0.05)  # m, whole sides
 TRAY = 0.30  # m, inner side of the tray
 SUITES: dict[str, SceneConfig] = {
     "blocked": SceneConfig(slots=("box",) * 4 + ("arch",) * 2, min_blocks=1),
-    "enclosed": SceneConfig(slots=("box",) * 5 + ("cylinder",), min_blocks=1),
+    "enclosed": SceneConfig(slots=("box",) * 5, min_blocks=1),
     "tray": SceneConfig(slots=("box",) * 4 + ("arch",), min_blocks=1, tray=TRAY),
     "hidden": SceneConfig(slots=("box",) * 6, min_blocks=1),
 }
@@ -184,7 +183,8 @@ def _frame(draw: _Draw) -> list[Laid]:
     """Encloses a block between two short blocks, and these between two bars."""
     (x, y), high = draw.many(2, 0.038, 0.044), draw(0.038, 0.050)
     ends, sides = draw.many(2, 0.038, 0.040), draw.many(2, 0.040, 0.055)
-    pieces, middle = [Laid((0.0, 0.0), (x, y, high))], 0.5 * (ends[1] - ends[0])
+    target = Laid((0.0, 0.0), (x, y, draw(0.75, 1.0) * high))
+    pieces, middle = [target], 0.5 * (ends[1] - ends[0])
     for way, end, side in zip((-0.5, 0.5), ends, sides, strict=True):
         pieces.append(Laid((way * (x + end), 0.0), (end, y, high)))
         pieces.append(Laid((middle, way * (y + side)), (x + sum(ends), side, high)))
@@ -202,28 +202,25 @@ def _dock(draw: _Draw) -> list[Laid]:
     return [*pieces, Laid((behind, aside), (back, width + sum(arms), high))]
 
 
-def _alcove(draw: _Draw) -> list[Laid]:
-    """Puts a low block into a U of three high ones; with the one behind it exceeds the opening."""
-    (x, y), (low, high) = draw.many(2, 0.048, 0.052), (draw(0.030, 0.045), draw(0.052, 0.070))
-    deep, behind = draw(0.064, 0.070), draw(0.056, 0.075)
-    pieces = [Laid((0.0, 0.0), (x, y, low)), Laid((-0.5 * (x + deep), 0.0), (deep, behind, high))]
+def _zipper(draw: _Draw) -> list[Laid]:
+    """Encloses a bar longer than the opening by two pairs of blocks along its sides."""
+    wide, high = draw(0.038, 0.046), draw(0.036, 0.050)
+    pieces = [Laid((0.0, 0.0), (draw.long(), wide, high))]
     for way in (-0.5, 0.5):
-        wide, long = draw(0.036, 0.050), draw.long()
-        pieces.append(Laid((0.5 * (long - x), way * (y + wide)), (long, wide, high)))
+        deep = draw(0.045, 0.060)
+        for along in (-0.5, 0.5):
+            long = draw(0.057, 0.062)
+            pieces.append(Laid((along * long, way * (wide + deep)), (long, deep, high)))
     return pieces
 
 
-def _pinwheel(draw: _Draw) -> list[Laid]:
-    """Puts three bars round a block or a cylinder; two of them end at the side of the next."""
-    side, wide, high = draw(0.048, 0.058), draw(0.064, 0.068), draw(0.035, 0.050)
-    pieces = [Laid((0.0, 0.0), (side, side, high))]
-    if draw(0.0, 1.0) < 0.4:
-        side, wide, high = CYLINDER[0], wide + 0.004, CYLINDER[2]
-        pieces = [Laid((0.0, 0.0), CYLINDER, kind="cylinder", exact=True)]
-    out, along = 0.5 * (side + wide), 0.5 * wide
-    for x, y in _SIDES[:3]:
-        size = (side + wide, wide) if y else (wide, side + wide)
-        pieces.append(Laid((x * out + y * along, y * out - x * along), (*size, high)))
+def _trench(draw: _Draw) -> list[Laid]:
+    """Puts a low bar longer than the opening between two high slabs."""
+    wide, (low, high) = draw(0.048, 0.058), (draw(0.030, 0.042), draw(0.050, 0.060))
+    pieces = [Laid((0.0, 0.0), (draw.long(), wide, low))]
+    for way in (-0.5, 0.5):
+        deep = draw(0.045, 0.060)
+        pieces.append(Laid((draw(-0.003, 0.003), way * (wide + deep)), (draw.long(), deep, high)))
     return pieces
 
 
@@ -323,7 +320,6 @@ TRAIN = _constructions(
     arcade=("blocked", _arcade),
     frame=("enclosed", _frame),
     dock=("enclosed", _dock),
-    alcove=("enclosed", _alcove),
     corners=("tray", _corners),
     moored=("tray", _moored),
     roof=("hidden", _roof),
@@ -332,7 +328,8 @@ TRAIN = _constructions(
 TEST = _constructions(
     parquet=("blocked", _parquet),
     crib=("blocked", _crib),
-    pinwheel=("enclosed", _pinwheel),
+    zipper=("enclosed", _zipper),
+    trench=("enclosed", _trench),
     berth=("tray", _berth),
     nook=("tray", _nook),
     shed=("hidden", _shed),
