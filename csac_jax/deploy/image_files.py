@@ -4,7 +4,7 @@ import contextlib
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import imageio.v2
 import imageio.v3
@@ -17,11 +17,14 @@ from csac_jax.errors import SettingsError, first_fault
 from csac_jax.io import files
 from csac_jax.section import require
 
+_FOUR = {"type": "array", "minItems": 4, "maxItems": 4}
+_MATRIX = pydantic.WithJsonSchema({**_FOUR, "items": {**_FOUR, "items": {"type": "number"}}})
+
 
 class PoseBody(pydantic.BaseModel, extra="forbid"):
     """A pose as its file has it, m."""
 
-    matrix: list[list[float]]  # 4 x 4
+    matrix: Annotated[list[list[float]], _MATRIX]  # 4 x 4
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -92,7 +95,7 @@ def _opened(content: bytes) -> Iterator[Any]:
     except SettingsError:
         raise
     except Exception as error:  # damaged images raise nearly anything
-        raise SettingsError(f"the image is damaged: {files.first_line(error)}") from None
+        raise SettingsError(f"the image is damaged or huge: {files.first_line(error)}") from None
 
 
 def _size(file: Any) -> tuple[int, int]:

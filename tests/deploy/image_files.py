@@ -18,7 +18,7 @@ def rounded(image: Image) -> Image:
 
 
 def png_start(*sizes: tuple[int, int]) -> bytes:
-    """Returns a PNG of 8-bit colours, cut off in its pixels, with a header for each of the sizes."""
+    """Returns a PNG of 8-bit colours, cut off in its pixels, with a header per size."""
     heads = (struct.pack(">IIBBBBB", *size, 8, 2, 0, 0, 0) for size in sizes)
     chunks = [*((b"IHDR", head) for head in heads), (b"IDAT", zlib.compress(bytes(100)))]
     parts = (
