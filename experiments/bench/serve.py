@@ -2,13 +2,15 @@
 
 Starts `csac-jax serve shipped` in its own process. Then 1, 10, 50 and 200 clients ask again and
 again for SECONDS (60) each; one that is refused waits for half a second. Times are the client's,
-from sending the images to having the answer. At the end SIGTERM comes as 50 requests wait.
+from sending the images to having the answer. Then 10 ask beside a hostile client. At the end
+SIGTERM comes as 50 requests wait.
 """
 
 import concurrent.futures
 import http.client
 import json
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -23,6 +25,7 @@ from experiments.bench._options import timed
 
 PATIENCE = 300.0  # s, until it has compiled
 CLIENTS = (1, 10, 50, 200)
+BOTHERED = 10  # clients beside a hostile one
 LAST = 50  # clients as it is stopped
 REST = 0.5  # s, after a refusal
 
@@ -94,16 +97,32 @@ def _milliseconds(name: str, seconds: list[float]) -> dict[str, float]:
     return {f"{name}_{level}_ms": round(float(value), 1) for level, value in named}
 
 
-def load(port: int, content: bytes, clients: int, seconds: float) -> dict[str, Any]:
-    """Measures `clients` that ask at once, and /health as they do."""
+def _bother(end: float, port: int) -> None:
+    """Sends each second a body of 14 MB with a million keys, and half of a head."""
+    body, silent = b"{" + b",".join(b'"%d":0' % i for i in range(1_200_000)) + b"}", []
+    while time.perf_counter() < end:
+        silent.append(socket.create_connection(("127.0.0.1", port)))
+        silent[-1].sendall(b"POST /decide HTTP/1.1\r\n")
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
+        connection.request("POST", "/decide", body)
+        connection.getresponse().read()
+        time.sleep(1.0)
+
+
+def load(
+    port: int, content: bytes, clients: int, seconds: float, hostile: bool = False
+) -> dict[str, Any]:
+    """Measures `clients` that ask at once, and /health as they do; maybe with a hostile one."""
     begun, health = time.perf_counter(), []
-    with concurrent.futures.ThreadPoolExecutor(clients) as pool:
+    with concurrent.futures.ThreadPoolExecutor(clients + 1) as pool:
         end = begun + seconds
+        bothering = pool.submit(_bother, end if hostile else begun, port)
         asking = [pool.submit(_ask_until, end, port, content) for _ in range(clients)]
         while time.perf_counter() < end:
             health.append(_health(port))
             time.sleep(0.1)
         replies = [reply for future in asking for reply in future.result()]
+        bothering.result()
     answered = [reply for reply in replies if reply.status == 200]
     refused = [reply.seconds for reply in replies if reply.status == 429]
     return {
@@ -148,13 +167,14 @@ def measure(seconds: int, port: int) -> dict[str, Any]:
         started = time.perf_counter() - begun
         first = ask(port, content).seconds
         loads = [load(port, content, clients, seconds) for clients in CLIENTS]
+        hostile = load(port, content, BOTHERED, seconds, hostile=True)
         memory = _peak_mib(process)
         stop = _stop(port, content, process)
     finally:
         process.kill()
         process.wait()
     result = {"body_bytes": len(content), "started_s": started, "first_request_s": first}
-    return {**result, "peak_mib": memory, "loads": loads, "stop": stop}
+    return {**result, "peak_mib": memory, "loads": loads, "hostile": hostile, "stop": stop}
 
 
 def main(arguments: list[str]) -> None:
