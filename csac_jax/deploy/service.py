@@ -76,9 +76,9 @@ class Bodies:
     async def _fill(self, body: bytearray, request: Request, largest: int, is_full: bool) -> None:
         """Reads the whole body. Of one that is refused it discards the rest, up to MOST_DISCARDED:
         a client that still sends sees no answer."""
-        size, refusal = 0, _too_many() if is_full else None
+        size, refusal, clock = 0, _too_many() if is_full else None, asyncio.get_running_loop().time
         try:
-            async with asyncio.timeout(SLOWEST_REFUSAL if is_full else SLOWEST_BODY):
+            async with asyncio.timeout(SLOWEST_REFUSAL if is_full else SLOWEST_BODY) as limit:
                 async for piece in request.stream():
                     size += len(piece)
                     if refusal is None and size > largest:
@@ -86,6 +86,7 @@ class Bodies:
                         refusal = _refused(413, text)
                     if refusal is None and self._held + len(piece) > MOST_HELD:
                         refusal = _too_many()
+                        limit.reschedule(clock() + SLOWEST_REFUSAL)
                     if refusal is None:
                         body += piece
                         self._held += len(piece)

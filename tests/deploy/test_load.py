@@ -194,6 +194,25 @@ def test_one_bad_image_spoils_no_batch(
     assert max(map(len, running.policy.batches)) == 4
 
 
+def test_failing_policy_stops_nothing(
+    start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: where the policy itself fails, its batch gets the status 500, and the next is
+    answered."""
+    running = start()
+
+    def fail(*_: Any) -> None:
+        raise RuntimeError("out of memory")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(running.policy, "decide_each", fail)
+        for _ in range(2 * decider.THREADS):
+            connection = running.send("/decide", BODY)
+            assert connection.getresponse().status == 500
+            connection.close()
+    assert running.ask("/decide", BODY)[0] == 200
+
+
 def test_full_queue_answers_at_once(start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch):
     """Claim: of 200 clients each is answered or gets the status 429 within a second. /health
     answers in half of one."""
@@ -256,13 +275,15 @@ def test_memory_of_bodies_is_bounded(
     start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ):
     """Claim: bodies that are held have MOST_HELD bytes in all. What does not fit gets the status
-    429; what was held by those that left is free again."""
+    429 soon, though its client stalls; what was held by those that left is free again."""
     monkeypatch.setattr(service, "MOST_HELD", 2**20)
     running = start()
-    slow = running.connect()
-    slow.sendall(b"POST /decide HTTP/1.1\r\nhost: a\r\ncontent-length: 2000000\r\n\r\n")
-    slow.sendall(bytes(900_000))
-    time.sleep(0.3)
+    slow, stalled = running.connect(), running.connect()
+    for connection, size in ((slow, 900_000), (stalled, 200_000)):
+        head = b"POST /decide HTTP/1.1\r\nhost: a\r\ncontent-length: 2000000\r\n\r\n"
+        connection.sendall(head + bytes(size))
+        time.sleep(0.3)
+    assert stalled.recv(99).startswith(b"HTTP/1.1 429")
     large = {**BODY, "mask": "A" * 200_000}
     assert running.ask("/decide", large)[0] == 429
     assert running.ask("/decide", BODY)[0] == 200
