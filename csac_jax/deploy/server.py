@@ -25,24 +25,25 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
             transport.abort()
-        self._expire_after(SLOWEST_HEAD)
+        self._expire_after(SLOWEST_HEAD, None)
 
     def on_response_complete(self) -> None:
-        """Waits for the next request."""
+        """Waits for the next request, which may be there already."""
+        answered = self.cycle
         super().on_response_complete()
-        self._expire_after(SLOWEST_HEAD)
+        self._expire_after(SLOWEST_HEAD, answered)
 
-    def _expire_after(self, seconds: float) -> None:
+    def _expire_after(self, seconds: float, request: Any) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = self.loop.call_later(seconds, self._expire, self.cycle)
+        self._timer = self.loop.call_later(seconds, self._expire, request)
 
     def _expire(self, request: Any) -> None:
         """Ends the connection if it has had no new request since `request`."""
         if self.cycle is request:
             self.transport.abort()
         else:
-            self._expire_after(SLOWEST_ANSWER)
+            self._expire_after(SLOWEST_ANSWER, self.cycle)
 
 
 def claim(host: str, port: int) -> socket.socket:
