@@ -1,10 +1,12 @@
 """An image as a depth camera gives it, drawn by our own rays: to try `csac-jax act` without one.
 
 python examples/camera_image.py demo          # rgb.png, depth.png, intrinsics.json, pose.json
+                                              # and request.json, all of them for `csac-jax serve`
 python examples/camera_image.py empty --empty # the same camera over the empty table
 python examples/camera_image.py board --board board.png  # the table with a printed page on it
 """
 
+import base64
 import json
 import sys
 from pathlib import Path
@@ -60,7 +62,7 @@ def lay(cfg: CameraConfig, colour: np.ndarray, page: np.ndarray) -> np.ndarray:
 
 
 def main(folder: str, *options: str) -> None:
-    """Writes the four files."""
+    """Writes the files."""
     cfg, out = CameraConfig(), Path(folder)
     eye, pose = camera.make(cfg), np.eye(4)
     pose[:3, :3], pose[:3, 3] = eye.rotation, eye.position
@@ -75,6 +77,10 @@ def main(folder: str, *options: str) -> None:
     imageio.imwrite(out / "depth.png", depth)
     (out / "intrinsics.json").write_text(json.dumps(intrinsics))
     (out / "pose.json").write_text(json.dumps({"matrix": pose.tolist()}))
+    images = {name: (out / f"{name}.png").read_bytes() for name in ("rgb", "depth")}
+    request = {name: base64.b64encode(content).decode() for name, content in images.items()}
+    request |= {"intrinsics": intrinsics, "pose": {"matrix": pose.tolist()}}
+    (out / "request.json").write_text(json.dumps(request))
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ ONLY_IN = {
     "jax2onnx": ("deploy/onnx.py",),
     "cv2": ("deploy/board.py",),
     "fastapi": ("deploy/service.py",),
-    "uvicorn": ("cli/serve.py",),
+    "uvicorn": ("deploy/server.py",),
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
     "gymnasium": ("gym.py",),

@@ -1,6 +1,7 @@
 """`csac-jax serve`: a policy as an HTTP service."""
 
 import dataclasses
+import shlex
 from pathlib import Path
 
 from csac_jax.cli import parsing
@@ -14,8 +15,8 @@ SHORTEST_TOKEN = 16  # characters
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ServeOptions(RobotOptions):
-    """Answers images by decisions over HTTP: POST /decide, POST /outcome, GET /health, GET
-    /version."""
+    """Answers images by decisions over HTTP: POST /decide and /outcome, GET /health, /version and
+    /openapi.json."""
 
     port: int = 8000
     """Port to listen on; 0 takes a free one."""
@@ -35,15 +36,26 @@ def run(arguments: list[str]) -> int:
     token = _token(options)
     require(0 <= options.port < 2**16, "--port: must lie in 0 .. 65535")
     check_size(options.size)
-    import uvicorn
+    from csac_jax.deploy import decider, server, service
 
-    from csac_jax.deploy import service
-
-    policy, recorder = options.load(), options.recorder()
-    policy.warm_up(*options.size)
-    app = service.make(policy, options.policy, token, recorder)
-    uvicorn.run(app, host=options.host, port=options.port, log_level="warning", lifespan="off")
+    with server.claim(options.host, options.port) as listener:
+        policy, recorder = options.load(), options.recorder()
+        policy.warm_up(*options.size, decider.batches())
+        app = service.make(policy, options.policy, token, recorder, options.size)
+        print(_usage(options, listener.getsockname()[1]), flush=True)
+        server.configured(app).run(sockets=[listener])
     return 0
+
+
+def _usage(options: ServeOptions, port: int) -> str:
+    """Returns where the service listens, and a call of it."""
+    host = f"[{options.host}]" if ":" in options.host else options.host
+    url, file = f"http://{host}:{port}", shlex.quote(str(options.token_file))
+    token = "" if options.token_file is None else f' -H "Authorization: Bearer $(head -n 1 {file})"'
+    return (
+        f"listens on {url}; {url}/openapi.json says what it answers\n"
+        f"try: curl{token} -d @request.json {url}/decide"
+    )
 
 
 def _token(options: ServeOptions) -> str | None:

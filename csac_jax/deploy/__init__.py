@@ -8,6 +8,8 @@ docs/robot.md goes from an unboxed camera to the first grasp.
 """
 
 import dataclasses
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,15 +18,15 @@ import numpy as np
 
 from csac_jax import grippers
 from csac_jax.agent.actor_critic import Params
-from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import Config
 from csac_jax.deploy import checks, decision, images
 from csac_jax.deploy.checks import CameraReport
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import CameraView
-from csac_jax.errors import SettingsError
+from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.io import policy_file
 from csac_jax.runtime import cache
+from csac_jax.section import require
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
@@ -33,8 +35,8 @@ MOST_ALTERNATIVES = 64
 
 _supported = jax.jit(depth_camera.supported)
 _observe = jax.jit(decision.observe, static_argnums=0)
-_dense_maps = jax.jit(decision.dense_maps, static_argnums=(0, 3))
-_choose = jax.jit(decision.choose, static_argnums=0)
+_batch_maps = jax.jit(decision.batch_maps, static_argnums=(0, 3))
+_choose = jax.jit(jax.vmap(decision.choose, (None, 0, 0)), static_argnums=0)
 _best_over_yaws = jax.jit(decision.best_over_yaws, static_argnums=0)
 
 
@@ -87,38 +89,59 @@ class CameraPolicy:
         bool, the object to get. Raises SettingsError for arrays of a wrong form, ViewError for an
         image that does not fit the pose. Warns (DataWarning) if colours seem to be BGR.
         """
-        if not 1 <= top <= MOST_ALTERNATIVES:
-            raise SettingsError(f"top: must lie in 1 .. {MOST_ALTERNATIVES}, not {top}")
-        obs, state = self._maps(rgb, depth, intrinsics, camera_pose, target_mask)
-        decisions: list[Decision] = []
-        for _ in range(top):
-            choice, state = _choose(self.cfg, state, obs.height)
-            if not choice.valid:
+        check_top(top)
+        obs = self.observe(rgb, depth, intrinsics, camera_pose, target_mask)
+        return self.decide_each([obs], [top], target_mask is not None)[0]
+
+    def decide_each(
+        self, observations: Sequence[Observation], tops: Sequence[int], only_target: bool
+    ) -> list[list[Decision]]:
+        """Decides about several views at once, each as `decide` with its `top`.
+
+        Args: observations, those of `inspect`; only_target, True if their images have masks.
+        """
+        cache.enable()
+        obs = _stack(observations)
+        state = _batch_maps(self.cfg, self.params, obs, only_target)
+        decisions: list[list[Decision]] = [[] for _ in observations]
+        for number in range(max(tops)):
+            batch, state = _choose(self.cfg, state, obs.height)
+            batch = jax.device_get(batch)
+            for i in np.flatnonzero(batch.valid & (number < np.array(tops))):
+                choice = jax.tree.map(lambda leaf, i=i: leaf[i], batch)
+                decisions[i].append(decision.from_choice(choice, self.workspace_pose))
+            if not batch.valid.any():
                 break
-            decisions.append(decision.from_choice(jax.device_get(choice), self.workspace_pose))
         return decisions
 
     def maps(
         self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
     ) -> Maps:
         """Returns the maps that decisions about this image follow from."""
-        obs, state = self._maps(rgb, depth, intrinsics, camera_pose, target_mask)
-        return Maps(np.asarray(obs.height), np.asarray(_best_over_yaws(self.cfg, state)))
-
-    def _maps(self, *image: Any) -> tuple[Observation, DenseMaps]:
         cache.enable()
-        obs = self.observe(*image)
-        return obs, _dense_maps(self.cfg, self.params, obs, image[-1] is not None)
+        obs = self.observe(rgb, depth, intrinsics, camera_pose, target_mask)
+        state = _batch_maps(self.cfg, self.params, _stack([obs]), target_mask is not None)
+        q = _best_over_yaws(self.cfg, jax.tree.map(lambda leaf: leaf[0], state))
+        return Maps(np.asarray(obs.height), np.asarray(q))
 
     def observe(
         self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
     ) -> Observation:
         """Returns the view from above that decisions about this image follow from."""
+        obs, doubts = self.inspect(rgb, depth, intrinsics, camera_pose, target_mask)
+        for doubt in doubts:
+            warnings.warn(doubt, DataWarning, stacklevel=3)
+        return obs
+
+    def inspect(
+        self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any, target_mask: Any = None
+    ) -> tuple[Observation, list[str]]:
+        """Returns the view from above, and what is doubtful about the image, one line each."""
         view = images.make(rgb, depth, intrinsics, camera_pose, target_mask)
         if view.target is None and self.cfg.task.kind == "target":
             raise SettingsError("target_mask: this policy gets a marked object; mark one")
-        checks.fits(view, self.cfg.heightmap)
-        return _observe(self.cfg, *_pixels(view))
+        doubts = checks.fits(view, self.cfg.heightmap)
+        return _observe(self.cfg, *_pixels(view)), doubts
 
     def check(self, rgb: Any, depth: Any, intrinsics: Any, camera_pose: Any) -> CameraReport:
         """Measures the camera by an image of the empty table.
@@ -134,16 +157,25 @@ class CameraPolicy:
         covered = np.sum(height > BARE) * 1e4 * self.cfg.heightmap.cell**2
         return CameraReport(**vars(table), seen=float(seen), covered_cm2=float(covered))
 
-    def warm_up(self, width: int, height: int) -> None:
-        """Compiles decisions about images of this size, px."""
-        n, rows = width * height, (self.cfg.heightmap.size,) * 2
+    def warm_up(self, width: int, height: int, batches: Sequence[int] = (1,)) -> None:
+        """Compiles decisions about images of this size, px, and about batches of these sizes."""
+        n = width * height
         pixels = np.zeros((n, 3), np.float32), np.zeros(n, bool), np.zeros((n, 3), np.uint8)
         target = np.zeros(n, bool) if self.cfg.task.kind == "target" else None
         cache.enable()
         obs = _observe(self.cfg, *pixels, target)
         _supported(np.zeros((height, width), np.float32), 1.0)
-        state = _dense_maps(self.cfg, self.params, obs, target is not None)
-        jax.block_until_ready(_choose(self.cfg, state, jax.numpy.zeros(rows)))
+        for size in batches:
+            self.decide_each([obs] * size, [1] * size, target is not None)
+
+
+def check_top(top: int) -> None:
+    """Raises SettingsError for a number of decisions that none can be asked for."""
+    require(1 <= top <= MOST_ALTERNATIVES, f"top: must lie in 1 .. {MOST_ALTERNATIVES}, not {top}")
+
+
+def _stack(observations: Sequence[Observation]) -> Observation:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *observations)
 
 
 def _pixels(view: CameraView) -> tuple[Any, ...]:

@@ -4,7 +4,6 @@ They raise ViewError, one line that says what is wrong by how much.
 """
 
 import dataclasses
-import warnings
 
 import numpy as np
 from scipy import ndimage
@@ -13,7 +12,7 @@ from csac_jax.config import HeightmapConfig
 from csac_jax.constants import CHANGE_AREA
 from csac_jax.deploy import images
 from csac_jax.deploy.images import CameraView
-from csac_jax.errors import DataWarning, ViewError
+from csac_jax.errors import ViewError
 from csac_jax.world.blocks import COLOURS
 
 TABLE_TOLERANCE = 0.008  # m (ours): finger tips go down to 12 mm above z = 0
@@ -58,8 +57,8 @@ class CameraReport(Table):
         return [fault for holds, fault in faults if holds]
 
 
-def fits(view: CameraView, cfg: HeightmapConfig) -> None:
-    """Runs all checks."""
+def fits(view: CameraView, cfg: HeightmapConfig) -> list[str]:
+    """Runs all checks; returns what is doubtful, one line each."""
     pose(view)
     depth_unit(view, cfg.extent)
     plane = table(view, cfg.extent)
@@ -70,7 +69,8 @@ def fits(view: CameraView, cfg: HeightmapConfig) -> None:
             f"{1e3 * TABLE_TOLERANCE:.0f} are allowed; measure camera_pose again"
         )
     _coverage(view, cfg)
-    colours(view, cfg.extent)
+    text = "rgb: red and blue seem to be swapped (OpenCV reads BGR); give rgb[..., ::-1]"
+    return [text] if colours_swapped(view, cfg.extent) else []
 
 
 def pose(view: CameraView) -> None:
@@ -191,18 +191,15 @@ def _coverage(view: CameraView, cfg: HeightmapConfig) -> None:
     )
 
 
-def colours(view: CameraView, extent: float) -> None:
-    """Warns of objects with the colours of the training's blocks, red and blue swapped."""
+def colours_swapped(view: CameraView, extent: float) -> bool:
+    """Returns True if objects have the colours of the training's blocks, red and blue swapped."""
     points, valid = view.points[view.sparse], view.valid[view.sparse]
     above = valid & (points[..., 2] > 0.02)
     above &= np.all(np.abs(points[..., :2]) <= 0.5 * extent, axis=-1)
     objects = view.colour[view.sparse][above].astype(np.float32)
     if len(objects) < _LEAST:
-        return
-    as_given, swapped = _hue_distance(objects), _hue_distance(objects[:, ::-1])
-    if swapped < _SWAPPED * as_given:
-        text = "rgb: red and blue seem to be swapped (OpenCV reads BGR); give rgb[..., ::-1]"
-        warnings.warn(text, DataWarning, stacklevel=4)
+        return False
+    return _hue_distance(objects[:, ::-1]) < _SWAPPED * _hue_distance(objects)
 
 
 def _hue_distance(colour: np.ndarray) -> float:

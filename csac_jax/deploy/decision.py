@@ -86,18 +86,23 @@ def fingers(cfg: Config) -> jax.Array | None:
 
 
 def dense_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:
-    """Computes the dense maps of one state.
+    """Computes the dense maps of one state; see `batch_maps`."""
+    batch = batch_maps(cfg, params, jax.tree.map(lambda leaf: leaf[None], obs), only_target)
+    return jax.tree.map(lambda leaf: leaf[0], batch)
+
+
+def batch_maps(cfg: Config, params: Params, obs: Observation, only_target: bool) -> DenseMaps:
+    """Computes the dense maps of states, leaves [B, ...].
 
     With `only_target`, a policy whose networks see no target may only grasp, and only the target.
     """
     learner = actor_critic.make(cfg)
-    batch = values.decision_maps(learner, params, jax.tree.map(lambda leaf: leaf[None], obs))
-    state = jax.tree.map(lambda leaf: leaf[0], batch)
+    state = values.decision_maps(learner, params, obs)
     if not only_target or learner.frames.shows_target:
         return state
     frames = dataclasses.replace(learner.frames, shows_target=True, all_cells=False)
-    valid = maps.actionable_cells(frames, obs).at[int(Primitive.PUSH)].set(False)
-    return state.replace(valid=valid)
+    valid = jax.vmap(maps.actionable_cells, (None, 0))(frames, obs)
+    return state.replace(valid=valid.at[:, int(Primitive.PUSH)].set(False))
 
 
 def choose(cfg: Config, state: DenseMaps, height: jax.Array) -> tuple[Choice, DenseMaps]:

@@ -1,11 +1,13 @@
 """Images, intrinsics and poses as files. Each function raises SettingsError, one line."""
 
+import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import imageio.v2 as imageio
+import imageio.v2
+import imageio.v3
 import numpy as np
 import pydantic
 
@@ -15,11 +17,14 @@ from csac_jax.errors import SettingsError, first_fault
 from csac_jax.io import files
 from csac_jax.section import require
 
+_FOUR = {"type": "array", "minItems": 4, "maxItems": 4}
+_MATRIX = pydantic.WithJsonSchema({**_FOUR, "items": {**_FOUR, "items": {"type": "number"}}})
+
 
 class PoseBody(pydantic.BaseModel, extra="forbid"):
     """A pose as its file has it, m."""
 
-    matrix: list[list[float]]  # 4 x 4
+    matrix: Annotated[list[list[float]], _MATRIX]  # 4 x 4
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -68,16 +73,41 @@ def metres(depth: np.ndarray) -> np.ndarray:
 
 def decode(content: bytes) -> np.ndarray:
     """Decodes the pixels of an image file's content. Raises SettingsError."""
+    with _opened(content) as file:
+        cols, rows = _size(file)
+        fits = max(cols, rows) <= images.MOST_PIXELS
+        require(fits, f"the image has {cols} x {rows} px; at most {images.MOST_PIXELS} a side")
+        return file.read(index=0)
+
+
+def size(content: bytes) -> tuple[int, int]:
+    """Returns width and height, px, of what `decode` would decode. Raises SettingsError."""
+    with _opened(content) as file:
+        return _size(file)
+
+
+@contextlib.contextmanager
+def _opened(content: bytes) -> Iterator[Any]:
+    """Opens an image, whose pixels are decoded as they are read."""
     try:
-        return imageio.imread(content)
+        with imageio.v3.imopen(content, "r", plugin="pillow") as file:
+            yield file
+    except SettingsError:
+        raise
     except Exception as error:  # damaged images raise nearly anything
-        raise SettingsError(f"the image is damaged: {files.first_line(error)}") from None
+        raise SettingsError(f"the image is damaged or huge: {files.first_line(error)}") from None
+
+
+def _size(file: Any) -> tuple[int, int]:
+    """Returns width and height as the decoder takes them: a PNG's header may occur twice."""
+    rows, cols = file.properties(index=0).shape[:2]
+    return cols, rows
 
 
 def encode(pixels: np.ndarray, dots_per_inch: int = 72) -> bytes:
     """Encodes pixels [h, w] or [h, w, 3] uint8 as a PNG."""
     buffer = io.BytesIO()
-    imageio.imwrite(buffer, pixels, format="png", dpi=(dots_per_inch, dots_per_inch))
+    imageio.v2.imwrite(buffer, pixels, format="png", dpi=(dots_per_inch, dots_per_inch))
     return buffer.getvalue()
 
 

@@ -32,17 +32,20 @@ FORMAT = 1
 PUSHED = "pushed"  # the outcome of every push: its effect is seen in the next image
 KNOWN = (*OUTCOMES, PUSHED)
 _HEAD, _DECISION, _OUTCOME = "record.json", "decision.json", "outcome.json"
-_DIGITS = 6  # of an entry's name, or more
+_DIGITS, _MOST_DIGITS = 6, 18  # of an entry's name
 
 Image = tuple[Any, Any, Any, Any, Any]  # the arguments of `CameraPolicy.decide` but `top`
 _Number = Annotated[float, pydantic.Field(allow_inf_nan=False)]
+_WHOLE = pydantic.BeforeValidator(  # JSON does not tell 1 from 1.0
+    lambda value: int(value) if isinstance(value, float) and value.is_integer() else value
+)
 
 
 class ReportedOutcome(pydantic.BaseModel, extra="forbid", strict=True, frozen=True):
     """The outcome of an action, as a robot reports it."""
 
     outcome: Literal[KNOWN]  # type: ignore[valid-type]
-    number: Annotated[int, pydantic.Field(ge=1)] = 1  # of the decision carried out, 1 the best
+    number: Annotated[int, pydantic.Field(ge=1), _WHOLE] = 1  # of the decision done, 1 the best
     ended: bool = False  # no object to get is left, or the scene was changed by hand
 
     def check(self, decisions: Sequence[dict[str, Any]]) -> None:
@@ -134,7 +137,7 @@ class Recorder:
 
 def is_name(name: str) -> bool:
     """Returns True for the name of an entry."""
-    return len(name) >= _DIGITS and name.isascii() and name.isdigit()
+    return _DIGITS <= len(name) <= _MOST_DIGITS and name.isascii() and name.isdigit()
 
 
 def _check(folder: Path) -> None:

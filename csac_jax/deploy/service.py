@@ -6,172 +6,189 @@
     POST /outcome  {"id", "outcome", "number"?: 1, "ended"?: false} -> {"id"}; see `record`
     GET /health    {"status": "ok"}, with no token
     GET /version   versions, task and workspace of the policy
+    GET /openapi.json  the schema of all of them, with no token
 
 Errors are {"detail": one line} with a status of 400 to 499, or 507 if the record's disc is full.
-Decisions are taken one by one, and requests wait for their turn.
+Requests that wait are decided together; too many get the status 429. Threads do all that takes
+time, so /health answers at once.
 """
 
 import asyncio
-import base64
 import functools
 import secrets
-import struct
-import threading
-import time
-import warnings
+from collections.abc import AsyncIterator, Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import fastapi
-import numpy as np
 import pydantic
-from fastapi import Depends, HTTPException, Request
+from fastapi import Depends, HTTPException, Request, Response
 from fastapi.responses import JSONResponse
+from fastapi.security import HTTPBearer
 from starlette.requests import ClientDisconnect
 
-from csac_jax.deploy import CameraPolicy, image_files, images
-from csac_jax.deploy.image_files import PoseBody
-from csac_jax.deploy.record import Image, Recorder, ReportedOutcome
-from csac_jax.errors import DataWarning, SettingsError, ViewError, first_fault
+import csac_jax
+from csac_jax.deploy import CameraPolicy, requests
+from csac_jax.deploy.batching import Batcher, FullError
+from csac_jax.deploy.decider import THREADS, Decider, batch_size
+from csac_jax.deploy.record import Recorder
+from csac_jax.deploy.requests import LARGEST_BODY, LARGEST_OUTCOME
+from csac_jax.errors import SettingsError, ViewError, first_fault
 from csac_jax.runtime import provenance
-from csac_jax.section import require
 
-LARGEST_BODY = 16 * 2**20  # bytes: two images of 1280 x 720 px take a third
+MOST_HELD = 2**28  # bytes of bodies at a time
 MOST_DISCARDED = 8 * LARGEST_BODY
-SLOWEST_BODY = 30.0  # s, to send one
+SLOWEST_BODY = 10.0  # s, to send one
+SLOWEST_REFUSAL = 0.8  # s, to read the rest of a body that is refused since too many wait
 STATUS: dict[type[Exception], int] = {
     SettingsError: 400,
     ClientDisconnect: 400,
     FileNotFoundError: 404,
     ViewError: 422,
     pydantic.ValidationError: 422,
+    FullError: 429,
     OSError: 507,
 }
-_PNG, _PNG_START = struct.Struct(">16sII"), b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
-"""The start of a PNG: signature, length and name of the first chunk; then width and height."""
+_FAULTS: dict[int | str, dict[str, Any]] = {
+    status: {"model": requests.Fault} for status in sorted({401, 408, 413, *STATUS.values()})
+}
 
 
-class DecideRequest(pydantic.BaseModel, extra="forbid"):
-    """The body of /decide."""
+class Bodies:
+    """Readers of bodies, within bounds of size, time and memory."""
 
-    rgb: str
-    depth: str
-    intrinsics: dict[str, Any]
-    pose: PoseBody
-    mask: str | None = None
-    top: int = 1
+    def __init__(self) -> None:
+        self._held = 0  # bytes
 
+    def reader(self, largest: int, is_full: Callable[[], bool] = lambda: False) -> Any:
+        """Returns a dependency that reads a body and counts it until the request is answered."""
 
-class OutcomeRequest(ReportedOutcome, frozen=True):
-    """The body of /outcome."""
+        async def read(request: Request) -> AsyncIterator[bytearray]:
+            body = bytearray()
+            try:
+                await self._fill(body, request, largest, is_full())
+                yield body
+            finally:
+                self._held -= len(body)
 
-    id: str
+        return read
 
-
-async def read_body(request: Request) -> bytes:
-    """Reads the whole body; refuses one that is too large or too slow.
-
-    Of a larger body up to MOST_DISCARDED is read: a client that still sends sees no answer.
-    """
-    body, size = bytearray(), 0
-    try:
-        async with asyncio.timeout(SLOWEST_BODY):
-            async for piece in request.stream():
-                size += len(piece)
-                body += piece if size <= LARGEST_BODY else b""
-                if size > MOST_DISCARDED:
-                    break
-    except TimeoutError:
-        raise _refused(408, f"the body took more than {SLOWEST_BODY:.0f} s") from None
-    if size > LARGEST_BODY:
-        text = f"the body is larger than {LARGEST_BODY >> 20} MiB; send smaller images"
-        raise _refused(413, text)
-    return bytes(body)
+    async def _fill(self, body: bytearray, request: Request, largest: int, is_full: bool) -> None:
+        """Reads the whole body. Of one that is refused it discards the rest, up to MOST_DISCARDED:
+        a client that still sends sees no answer."""
+        size, refusal, clock = 0, _too_many() if is_full else None, asyncio.get_running_loop().time
+        try:
+            async with asyncio.timeout(SLOWEST_REFUSAL if is_full else SLOWEST_BODY) as limit:
+                async for piece in request.stream():
+                    size += len(piece)
+                    if refusal is None and size > largest:
+                        text = f"the body is larger than {largest >> 10} KiB; send less"
+                        refusal = _refused(413, text)
+                    if refusal is None and self._held + len(piece) > MOST_HELD:
+                        refusal = _too_many()
+                        limit.reschedule(clock() + SLOWEST_REFUSAL)
+                    if refusal is None:
+                        body += piece
+                        self._held += len(piece)
+                    if size > MOST_DISCARDED:
+                        break
+        except TimeoutError:
+            late = f"the body took more than {SLOWEST_BODY:.0f} s"
+            raise refusal or _refused(408, late) from None
+        if refusal is not None:
+            raise refusal
 
 
 def _refused(status: int, text: str) -> HTTPException:
     return HTTPException(status, text, {"connection": "close"})  # the rest of the body is not read
 
 
-Body = Annotated[bytes, Depends(read_body)]
+def _too_many() -> HTTPException:
+    return _refused(429, "too many requests wait; ask again later")
+
+
+async def unless_left(request: Request, work: Coroutine[Any, Any, Any]) -> Any:
+    """Awaits `work`; cancels it and raises ClientDisconnect as soon as the client leaves."""
+
+    async def left() -> None:
+        while (await request.receive())["type"] != "http.disconnect":
+            pass
+
+    tasks = asyncio.ensure_future(work), asyncio.ensure_future(left())
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        if not tasks[0].done():
+            raise ClientDisconnect
+        return tasks[0].result()
+    finally:
+        for task in tasks:
+            task.cancel()
 
 
 def make(
-    policy: CameraPolicy, source: str, token: str | None = None, recorder: Recorder | None = None
+    policy: CameraPolicy,
+    source: str,
+    token: str | None = None,
+    recorder: Recorder | None = None,
+    size: tuple[int, int] = (640, 480),
 ) -> Any:
     """Builds the service of a policy as an ASGI application.
 
-    /version names the `source`. A `recorder` stores images, decisions and outcomes.
+    /version names the `source`. A `recorder` stores images, decisions and outcomes. The policy is
+    warm for images of `size`, px.
     """
 
-    def check_token(request: Request) -> None:
+    async def check_token(request: Request) -> None:
         sent, wanted = request.headers.get("authorization", ""), f"Bearer {token}"
         if token is not None and not secrets.compare_digest(sent.encode(), wanted.encode()):
             raise _refused(401, "send the header Authorization: Bearer TOKEN")
 
-    app, turn = fastapi.FastAPI(openapi_url=None), threading.Lock()
+    batcher = Batcher(Decider(policy, recorder, size).answer, batch_size, THREADS)
+    bodies, disc, parsers = Bodies(), ThreadPoolExecutor(1, "disc"), ThreadPoolExecutor(2, "parse")
+    about = {"task": policy.cfg.task.kind, "extent": policy.cfg.heightmap.extent}
+    versions = {"policy": source, **about, "versions": provenance.versions()}
+    app = fastapi.FastAPI(
+        title="csac-jax serve", version=csac_jax.__version__, docs_url=None, redoc_url=None
+    )
     for kind, status in STATUS.items():
         app.add_exception_handler(kind, functools.partial(_one_line, status))
-    router = fastapi.APIRouter(dependencies=[Depends(check_token)])
+    guards = [Depends(check_token)]
+    guards += [] if token is None else [Depends(HTTPBearer(auto_error=False))]
+    router = fastapi.APIRouter(dependencies=guards, responses=_FAULTS)
 
     @app.get("/health")
-    def health() -> dict[str, str]:
+    async def health() -> dict[str, str]:
         return {"status": "ok"}
 
     @router.get("/version")
-    def version() -> dict[str, Any]:
-        extent, task = policy.cfg.heightmap.extent, policy.cfg.task.kind
-        about = {"policy": source, "task": task, "extent": extent}
-        return {**about, "versions": provenance.versions()}
+    async def version() -> dict[str, Any]:
+        return versions
 
-    @router.post("/decide")
-    def decide(body: Body) -> dict[str, Any]:
-        request = DecideRequest.model_validate_json(body)
-        image = _image(request)
-        with turn, warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", DataWarning)
-            begun = time.perf_counter()
-            decisions = policy.decide(*image, request.top)
-            seconds = time.perf_counter() - begun
-            entry = None if recorder is None else recorder.add(image, decisions)
-        return {
-            "decisions": [decision.to_dict() for decision in decisions],
-            "id": entry,
-            "warnings": [str(warning.message) for warning in caught],
-            "milliseconds": round(1e3 * seconds, 1),
-        }
+    question = Depends(bodies.reader(LARGEST_BODY, lambda: batcher.is_full))
+    answer: dict[int | str, dict[str, Any]] = {200: {"model": requests.DecideAnswer}}
+    sent = requests.schema(requests.DecideRequest)
 
-    @router.post("/outcome")
-    def post_outcome(body: Body) -> dict[str, Any]:
+    @router.post("/decide", openapi_extra=sent, responses=answer)
+    async def decide(request: Request, body: Annotated[bytearray, question]) -> Response:
+        loop = asyncio.get_running_loop()
+        asked = await loop.run_in_executor(parsers, requests.question, body)
+        content = await unless_left(request, batcher.ask(asked))
+        return Response(content, media_type="application/json")
+
+    report = Depends(bodies.reader(LARGEST_OUTCOME))
+
+    @router.post("/outcome", openapi_extra=requests.schema(requests.OutcomeRequest))
+    async def post_outcome(body: Annotated[bytearray, report]) -> dict[str, str]:
         if recorder is None:
             raise FileNotFoundError("the service records nothing; start it with a record")
-        request = OutcomeRequest.model_validate_json(body)
-        with turn:
-            recorder.post(request.id, ReportedOutcome(**request.model_dump(exclude={"id"})))
-        return {"id": request.id}
+        name, reported = requests.outcome(body)
+        await asyncio.get_running_loop().run_in_executor(disc, recorder.post, name, reported)
+        return {"id": name}
 
     app.include_router(router)
     return app
 
 
-def _one_line(status: int, _: Request, error: Exception) -> JSONResponse:
+async def _one_line(status: int, _: Request, error: Exception) -> JSONResponse:
     text = first_fault(error) if isinstance(error, pydantic.ValidationError) else str(error)
     return JSONResponse({"detail": " ".join(text.split())}, status)
-
-
-def _image(request: DecideRequest) -> Image:
-    rgb, depth = _pixels(request.rgb, "rgb"), image_files.metres(_pixels(request.depth, "depth"))
-    mask = None if request.mask is None else _pixels(request.mask, "mask")
-    return rgb, depth, request.intrinsics, request.pose.matrix, mask
-
-
-def _pixels(text: str, name: str) -> np.ndarray:
-    """Decodes a PNG in base64. Raises SettingsError for anything else, and for one too large."""
-    try:
-        content = base64.b64decode(text, validate=True)
-        start, width, height = _PNG.unpack_from(content)
-    except (ValueError, struct.error):
-        start, width, height = b"", 0, 0
-    require(start == _PNG_START, f"{name}: must be a PNG in base64")
-    fits = max(width, height) <= images.MOST_PIXELS
-    require(fits, f"{name}: at most {images.MOST_PIXELS} px a side")
-    return image_files.decode(content)

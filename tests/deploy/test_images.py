@@ -1,15 +1,19 @@
 """Images, intrinsics and poses as they are given: their geometry, and what is refused."""
 
+import os
 import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from csac_jax.deploy import images
+from csac_jax.deploy import image_files as files, images
 from csac_jax.deploy.images import Intrinsics
 from csac_jax.errors import SettingsError
-from tests.deploy import scenes
+from tests.deploy import image_files, scenes
 
 IDEAL = {"width": 64, "height": 48, "fx": 60.0, "fy": 62.0, "cx": 31.0, "cy": 24.5}
 LENS = (0.12, -0.25, 0.001, -0.002, 0.09)  # k1 k2 p1 p2 k3, as strong as a colour camera's
@@ -98,3 +102,44 @@ def test_wrong_form_is_refused(changes: dict[str, Any], message: str):
     with pytest.raises(SettingsError, match=re.escape(message)) as caught:
         images.make(**(sound | changes)).points  # noqa: B018, the rays are made here
     assert "\n" not in str(caught.value)
+
+
+READERS = {
+    "rgb.png": files.read_rgb,
+    "depth.png": files.read_depth,
+    "depth.npy": files.read_depth,
+    "mask.png": files.read_mask,
+    "mask.npy": files.read_mask,
+    "intrinsics.json": files.read_intrinsics,
+    "pose.json": files.read_pose,
+}
+
+
+@pytest.mark.parametrize(("name", "read"), READERS.items(), ids=READERS)
+def test_pipes_are_refused(tmp_path: Path, name: str, read: Callable[[Path], Any]):
+    """Claim: a pipe, which may never end, is no file of an image. It is refused at once."""
+    os.mkfifo(tmp_path / name)
+    errors: list[Exception] = []
+
+    def attempt() -> None:
+        try:
+            read(tmp_path / name)
+        except SettingsError as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=attempt, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert len(errors) == 1, "it waits"
+    assert f"{name}: is a folder, a pipe or a device" in str(errors[0])
+
+
+def test_size_is_that_of_the_pixels():
+    """Claim: an image's size is checked as it is decoded: of two headers the second counts, and an
+    image of more than 4,096 px a side is refused before it is decoded."""
+    assert files.size(image_files.png_start((64, 48))) == (64, 48)
+    assert files.size(image_files.png_start((64, 48), (5000, 50))) == (5000, 50)
+    with pytest.raises(SettingsError, match="has 5000 x 50 px; at most 4096 a side"):
+        files.decode(image_files.png_start((64, 48), (5000, 50)))
+    with pytest.raises(SettingsError, match="the image is damaged"):
+        files.decode(image_files.png_start((64, 48)))

@@ -11,7 +11,7 @@ from csac_jax import grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
 from csac_jax.deploy import CameraPolicy, Decision, decision as decisions_of
-from csac_jax.errors import SettingsError, ViewError
+from csac_jax.errors import DataWarning, SettingsError, ViewError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
@@ -97,6 +97,23 @@ def test_decides_as_in_simulation(decisions: list[Decision]):
     np.testing.assert_allclose(decisions[0].position[:2], descended[:2], atol=1e-3)
     assert np.cos(2 * (decisions[0].yaw - float(action.pose[2]))) > 0.999
     assert decisions[0].primitive == "grasp"
+
+
+def test_batch_decides_as_each_alone(policy: CameraPolicy):
+    """Claim: views that are decided about together get the decisions of each alone, as many as its
+    `top` asks for and there are. Swapped colours are warned of."""
+    empty, one = (scenes.take(scenes.blocks_at([pose])) for pose in ([3.0, 3.0, 0.0], [0, 0, 0.5]))
+    images, tops = (IMAGE, empty, one, IMAGE), (3, 2, 1, 1)
+    views = [policy.inspect(*image)[0] for image in images]
+    batch = policy.decide_each(views, tops, only_target=False)
+    assert [len(decisions) for decisions in batch] == [3, 0, 1, 1]
+    for image, top, decisions in zip(images, tops, batch, strict=True):
+        for got, alone in zip(decisions, policy.decide(*image, top=top), strict=True):
+            assert got.primitive == alone.primitive
+            np.testing.assert_allclose(got.position, alone.position, atol=1e-4)
+            np.testing.assert_allclose(got.score, alone.score, atol=1e-4)
+    with pytest.warns(DataWarning, match="red and blue seem to be swapped"):
+        policy.decide(*IMAGE._replace(rgb=IMAGE.rgb[..., ::-1]))
 
 
 def test_flying_pixels_are_left_out(policy: CameraPolicy):

@@ -6,7 +6,6 @@ import contextlib
 import http.client
 import json
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,9 +21,7 @@ from tests.deploy import image_files, scenes
 pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
 
-import uvicorn  # isort: skip
-
-from csac_jax.deploy import service  # isort: skip
+from csac_jax.deploy import decider, server, service  # isort: skip
 
 TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
@@ -36,7 +33,8 @@ def _base64(content: bytes) -> str:
 
 
 PNG = encode(IMAGE.rgb)
-HUGE = PNG[:16] + (60000).to_bytes(4, "big") * 2 + PNG[24:]  # px, by its header
+HUGE = image_files.png_start((9000, 9000))
+TWICE = image_files.png_start((640, 480), (4000, 4000))
 BODY: dict[str, Any] = {
     "rgb": _base64(PNG),
     "depth": _base64(encode(np.round(1000 * IMAGE.depth).astype(np.uint16))),
@@ -49,13 +47,10 @@ class Server:
     """A service in a thread."""
 
     def __init__(self, app: Any) -> None:
-        config = uvicorn.Config(app, port=0, log_level="error", lifespan="off")
-        self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        self._server, listener = server.configured(app), server.claim("127.0.0.1", 0)
+        self._thread = threading.Thread(target=self._server.run, args=([listener],), daemon=True)
         self._thread.start()
-        while not self._server.started:
-            time.sleep(0.01)
-        self.port = self._server.servers[0].sockets[0].getsockname()[1]
+        self.port = listener.getsockname()[1]
 
     def ask(self, method: str, path: str, body: Any = None, token: str = TOKEN) -> tuple[int, Any]:
         """Returns status and JSON of a request."""
@@ -76,12 +71,12 @@ class Server:
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
     loaded = CameraPolicy.load("shipped")
-    loaded.warm_up(640, 480)
+    loaded.warm_up(640, 480, decider.batches())
     return loaded
 
 
-@pytest.fixture(scope="module")
-def server(policy: CameraPolicy) -> Iterator[Server]:
+@pytest.fixture(scope="module", name="server")
+def _server(policy: CameraPolicy) -> Iterator[Server]:
     running = Server(service.make(policy, "shipped", TOKEN))
     yield running
     running.stop()
@@ -105,7 +100,7 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
     _, second = recording.ask("POST", "/decide", marked)
     assert [first["id"], second["id"]] == ["000001", "000002"]
     assert second["decisions"][0]["position"][1] < -0.03  # the block at y = -0.09
-    outcome = {"id": "000001", "outcome": "dropped", "number": 2, "ended": True}
+    outcome = {"id": "000001", "outcome": "dropped", "number": 2.0, "ended": True}
     assert recording.ask("POST", "/outcome", outcome) == (200, {"id": "000001"})
     one, two = record.read(tmp_path)
     assert one.outcome == record.ReportedOutcome(outcome="dropped", number=2, ended=True)
@@ -122,6 +117,7 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
     ("body", "status", "detail"),
     [
         ({"id": "../../etc", "outcome": "lifted"}, 404, "there is no decision ../../etc"),
+        ({"id": "1" * 256, "outcome": "lifted"}, 404, "there is no decision 1111"),
         ({"id": "000001", "outcome": "good"}, 422, "'outcome' should be 'nothing'"),
         ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "'number' should be"),
         ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
@@ -197,14 +193,15 @@ def test_token_is_asked_for(server: Server, path: str, token: str):
         ({**BODY, "top": 1000}, 400, "top: must lie in 1 .. 64, not 1000"),
         ({**BODY, "rgb": "%%%"}, 400, "rgb: must be a PNG in base64"),
         ({**BODY, "rgb": _base64(b"GIF89a" * 9)}, 400, "rgb: must be a PNG"),
-        ({**BODY, "rgb": _base64(HUGE)}, 400, "rgb: at most 4096 px a side"),
+        ({**BODY, "rgb": _base64(HUGE)}, 400, "rgb: has 9000 x 9000 px; at most 4,194,304"),
         ({**BODY, "rgb": _base64(PNG[:3000])}, 400, "the image is damaged"),
+        ({**BODY, "rgb": _base64(TWICE)}, 400, "rgb: has 4000 x 4000 px; at most 4,194,304"),
         ({**BODY, "depth": BODY["rgb"]}, 400, "depth: is uint8; give a PNG of 16 bits"),
         ({**BODY, "intrinsics": {"fx": 1}}, 400, "intrinsics: 'width' is missing"),
         ({**BODY, "pose": {"matrix": [[1.0]]}}, 400, "camera_pose: must be a 4 x 4 matrix"),
         ({**BODY, "pose": {"matrix": np.eye(4).tolist()}}, 422, "camera_pose: the workspace's cen"),
-        (b'{"rgb": ' + b"[" * 100_000, 422, ""),
-        (b" " * (16 * 2**20 + 1), 413, "the body is larger than 16 MiB"),
+        (b'{"rgb": ' + b"[" * 100_000, 400, "the body has more than 1000 keys and values"),
+        (b" " * (16 * 2**20 + 1), 413, "the body is larger than 16384 KiB"),
     ],
     ids=lambda value: value if isinstance(value, int) else "",
 )
