@@ -22,7 +22,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
-from csac_jax.training import programs
+from csac_jax.training import own_parts, programs
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
@@ -242,6 +242,7 @@ def load(
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
+    own_parts.check_loadable(folder, cfg, own_parts.Parts(network=network, learner=learner))
     state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)

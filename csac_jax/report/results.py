@@ -24,7 +24,6 @@ from csac_jax.report.variants import Json, Variant
 from csac_jax.section import require, shown
 
 ARCHIVE = ".tar.xz"  # of folders of runs
-RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 METRICS = {
     "grasp_success": "grasp success",
@@ -217,8 +216,8 @@ def _record(folder: Path, config: Json) -> Json:
     """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
     above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
-        record = _read_json(place / RECORD)
-        _check(record, _RECORD, RECORD)
+        record = _read_json(place / files.RECORD)
+        _check(record, _RECORD, files.RECORD)
         if record and renames.current(record.get("config", config)) == config:
             return record
     return {}

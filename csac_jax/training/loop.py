@@ -166,6 +166,9 @@ def _begin(
 def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
     """Raises SettingsError if the run has other settings, CheckpointError if there is no run."""
     stored = checkpoint.load_config(run_dir, at)
+    if stored.parts != cfg.parts:
+        was, now = (one.parts or "no parts of one's own" for one in (stored, cfg))
+        raise SettingsError(f"{run_dir} was trained with {was}, not with {now}; give the same")
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
     if names := ", ".join(configs.differences(longer, cfg)):
         remedy = "leave them out, or begin a new run; only train.actions may grow"
