@@ -249,7 +249,7 @@ def test_run_names_its_own_parts(tmp_path: Path, capsys: pytest.CaptureFixture):
     run = api.train(SMOKE, tmp_path / "mine", sampler=mine, **quiet)
     api.train(SMOKE, tmp_path / "plain", **quiet)
     name = own_parts.Parts(mine).names()
-    assert name.startswith(f"sampler {__name__}.Newest(share=0.5)@")
+    assert name.startswith(f"sampler {__name__}.Newest(share=0.5) @")
     stored = [configs.load_config(run.run_dir / "config.json"), checkpoint.load_config(run.run_dir)]
     assert [run.cfg.parts, *(cfg.parts for cfg in stored)] == [name] * 3
     assert files.read_object(run.run_dir / files.RECORD)["config"]["parts"] == name

@@ -1,5 +1,6 @@
 """README and docs: their code runs, their commands parse, their sentences are short."""
 
+import base64
 import importlib.util
 import json
 import re
@@ -27,8 +28,13 @@ from experiments import index
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 ROBOT, OBJECTS, GRIPPERS = (DOCS / name for name in ("robot.md", "objects.md", "grippers.md"))
+COMPARE = DOCS / "how-to" / "compare-my-part.md"
 ALL = [README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("**/*.md"))]
-PAGES = [page for page in ALL if "```python" in page.read_text() and page not in (ROBOT, OBJECTS)]
+PAGES = [
+    page
+    for page in ALL
+    if "```python" in page.read_text() and page not in (ROBOT, OBJECTS, COMPARE)
+]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 PROGRAMS = ("csac-jax", "make", "pip", "python", "jupyter", "source", "srun")
@@ -251,6 +257,28 @@ def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     page = re.sub(r"--episodes \d+", "--episodes 2", GRIPPERS.read_text())
     page = re.sub(r"(?m)^csac-jax .* \.\.\.$", "", page)  # the rest of it is in robot.md
     assert _run_page(page, text_blocks=True) == 10
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_compare_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the blocks and the command of the page on own parts run in their order, with a small
+    preset, two seeds and two episodes; the report has one figure with the part and CSAC-beta."""
+    monkeypatch.chdir(tmp_path)
+    small = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setattr(presets, "quick", lambda: small)
+    assert _run_page(NUMBERS.sub(r"\1=2", COMPARE.read_text())) == 4
+    page = Path("page/index.html").read_text()
+    (svg,) = re.findall(
+        r'Training of smoke: variants.*?src="data:image/svg\+xml;base64,([^"]+)', page, re.DOTALL
+    )
+    drawn = base64.b64decode(svg).decode()
+    assert "CSAC-beta (2)" in drawn
+    assert "RankExponential(share=0.2)" in drawn
+    difference = re.search("Differences in training.*?</table>", page, re.DOTALL)
+    assert difference is not None
+    assert "RankExponential" in difference[0]
 
 
 @pytest.mark.slow

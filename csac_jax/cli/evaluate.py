@@ -16,7 +16,7 @@ from csac_jax.cli import output, settings
 from csac_jax.cli.failures import check_seed
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
-from csac_jax.runtime import processes, signals
+from csac_jax.runtime import modules, processes, signals
 from csac_jax.section import require
 
 EPISODES = 50  # of every part of a suite, where neither --episodes nor --out is given
@@ -34,7 +34,8 @@ class EvalOptions:
     policy: str = "learned"
     """Actor: learned, the networks; random, above blocks; geometric, antipodal grasps from the
     height map; oracle, which reads the blocks' poses; planner, which simulates many actions;
-    learned+planner, which simulates those of the networks; or MODULE:NAME, your own."""
+    learned+planner, which simulates those of the networks; or MODULE:NAME, your own, or the name
+    that a module of --import registers."""
     suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
     """Scenes: in_distribution (like the training's), random10, random30, cases, packed, camera
     (ever worse ones), blocked, tray; target, enclosed, hidden (of that task); pile, tight,
@@ -134,8 +135,12 @@ def _measure(
     changes: dict[str, Any],
     suite: str,
     episodes: int,
+    own_modules: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Measures the policy in a suite; returns the metrics with all that they follow from."""
+    """Measures the policy in a suite; returns the metrics with all that they follow from. Loads
+    `own_modules`, which a process of its own lacks."""
+    for module in own_modules:
+        modules.load(module)
     from csac_jax.evaluation import policies, rollout, suites
     from csac_jax.io import configs
     from csac_jax.runtime import cache, provenance
@@ -184,7 +189,8 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
         _write_table(out, paths)
         print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
 
-    tasks = [(options, changes, suite, numbers[suite]) for suite in waiting]
+    own = modules.names()
+    tasks = [(options, changes, suite, numbers[suite], own) for suite in waiting]
     with output.progress() as bars:
         jobs = options.jobs or processes.cores()
         processes.each(_measure, tasks, jobs, _shown(bars), on_done)

@@ -1,8 +1,6 @@
 """Policies: objects that take one scene and a key, and return an action."""
 
 import dataclasses
-import importlib
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -22,6 +20,8 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
+from csac_jax.runtime import modules
+from csac_jax.section import require
 from csac_jax.training import own_parts, programs
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
@@ -285,11 +285,19 @@ def _imported(path: str) -> Callable[[Config], Policy]:
     """Imports `MODULE:NAME`, also from the current folder."""
     module, _, name = path.partition(":")
     try:
-        if (here := str(Path.cwd())) not in sys.path:
-            sys.path.insert(0, here)
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+        return getattr(modules.load(module), name)
+    except (SettingsError, AttributeError) as error:
         raise SettingsError(f"policy: '{path}' cannot be imported ({error})") from None
+
+
+def register(name: str, build: Callable[[Config], Policy]) -> None:
+    """Registers a policy, made from the config that it acts in, for `eval` and `play`.
+
+    Raises SettingsError if the name is taken.
+    """
+    taken = name in BASELINES or name in LEARNED
+    require(not taken, f"policy '{name}' exists; choose another name")
+    BASELINES[name] = build
 
 
 LEARNED = ("learned", "learned+planner")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report.comparison import Curve, ResultReport, Score, grouped
-from csac_jax.report.variants import NAMES, Variant, label
+from csac_jax.report.variants import NAMES, OWN_LEARNER, Variant, label
 
 PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7")
 """Colours that colour-blind readers can tell apart (Okabe and Ito 2008)."""
@@ -55,6 +55,7 @@ def draw(report: ResultReport) -> Iterator[Chart]:
         plain = [curve for curve in curves if curve.variant.unchanged]
         varied = [curve for curve in curves if not curve.variant.unchanged]
         algorithms = {curve.variant.algo for curve in varied}
+        algorithms |= {report.reference} if OWN_LEARNER in algorithms else set()
         base = [curve for curve in plain if curve.variant.algo in algorithms]
         if plain:
             yield Chart(f"methods-{preset}", f"Training of {preset}: methods", training(plain))

@@ -61,9 +61,8 @@ def variant(config: Json) -> Variant:
         for name, value in settings.items()
         if value != base.get(name, PARTS.get(name, value)) and name not in UNNAMED
     )
-    return Variant(
-        preset, OWN_LEARNER if "learner " in settings.get("parts", "") else algo, changed
-    )
+    has_learner = "learner " in settings.get("parts", "")
+    return Variant(preset, OWN_LEARNER if has_learner else algo, changed)
 
 
 @functools.cache

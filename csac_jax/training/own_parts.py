@@ -1,7 +1,7 @@
 """Parts of one's own in place of a config's: checked before a run, and named in its config.
 
 A name has the class with its module, the numbers that it was made with, and a digest of its source:
-`sampler my_module.Mine(share=0.2)@3f2a9c0145de`. So runs with other parts are other runs.
+`sampler my_module.Mine(share=0.2) @3f2a9c0145de`. So runs with other parts are other runs.
 """
 
 import dataclasses
@@ -55,7 +55,7 @@ def name(part: Any) -> str:
     kind = type(part)
     shown = [f"{key}={value}" for key, value in _fields(part).items() if _is_plain(value)]
     settings = f"({', '.join(shown)})" if shown else ""
-    return f"{kind.__module__}.{kind.__qualname__}{settings}@{_digest(part)}"
+    return f"{kind.__module__}.{kind.__qualname__}{settings} @{_digest(part)}"
 
 
 def _fields(part: Any) -> dict[str, Any]:
@@ -137,8 +137,5 @@ def check_loadable(source: Any, cfg: Config, parts: Parts) -> None:
         how = f"give it: csac_jax.load_policy({str(source)!r}, {kind}=...)"
         require(not lacking.get(kind), f"{source} was trained with {text}; {how}")
         if kind in lacking and text not in parts.names().split(SEPARATOR):
-            warnings.warn(
-                f"{source} was trained with {text}, this is {parts.names()}",
-                DataWarning,
-                stacklevel=3,
-            )
+            fault = f"{source} was trained with {text}, this is {parts.names()}"
+            warnings.warn(fault, DataWarning, stacklevel=3)

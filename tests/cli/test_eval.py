@@ -22,7 +22,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     calls: list[tuple[str, int]] = []
 
     def measure(
-        on_progress: Any, options: Any, changes: Any, suite: str, episodes: int
+        on_progress: Any, options: Any, changes: Any, suite: str, episodes: int, *_: Any
     ) -> dict[str, Any]:
         calls.append((suite, episodes))
         if len(calls) == 2:

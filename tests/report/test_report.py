@@ -128,21 +128,21 @@ def test_own_parts_are_other_variants(tmp_path: Path):
     """Claim: runs and evaluations with parts of one's own are named by them and not pooled with
     others of the same config; with a learner of one's own no algorithm is named. Their command says
     that an option does not make them."""
-    for name, parts in (("plain", {}), ("a", {"parts": "sampler my.Mine@0123456789ab"})):
+    for name, parts in (("plain", {}), ("a", {"parts": "sampler my.Mine @0123456789ab"})):
         for seed in range(2):
             _run(tmp_path / name / f"seed-{seed}", _config("csac_beta", seed) | parts, [0.5, 0.6])
             path = tmp_path / name / f"seed-{seed}/eval.json"
             _evaluation(path, _config("csac_beta", seed) | parts, 5)
-    _run(tmp_path / "b", _config("csac_beta", 0) | {"parts": "learner my.Own@0123456789ab"}, [0.5])
+    _run(tmp_path / "b", _config("csac_beta", 0) | {"parts": "learner my.Own @0123456789ab"}, [0.5])
     report = _report(tmp_path)
     names = {variants.label(curve.variant): len(curve.runs) for curve in report.curves}
-    mine = "CSAC-beta (paper), sampler my.Mine@0123456789ab"
-    own = "own learner (paper), learner my.Own@0123456789ab"
+    mine = "CSAC-beta (paper), sampler my.Mine @0123456789ab"
+    own = "own learner (paper), learner my.Own @0123456789ab"
     assert names == {"CSAC-beta (paper)": 2, mine: 2, own: 1}
     assert {score.name: score.seeds for score in report.scores} == {"CSAC-beta (paper)": 2, mine: 2}
     rows = result_tables.provenance(report)
     commands = {row["file"]: row["settings as a command"] for row in rows}
-    by = ", by csac_jax.train with sampler my.Mine@0123456789ab"
+    by = ", by csac_jax.train with sampler my.Mine @0123456789ab"
     assert commands["a/seed-0/metrics.jsonl"].endswith(by)
     assert "parts" not in commands["a/seed-0/eval.json"]
     assert " by " not in commands["plain/seed-0/metrics.jsonl"]

@@ -60,19 +60,19 @@ def test_name_follows_the_source(tmp_path: Path):
     too, the same in every process."""
     one, again, other = (_named(tmp_path, value) for value in (1, 1, 2))
     assert one == again != other
-    assert one.partition("@")[0] == other.partition("@")[0] == "own.Own"
+    assert one.partition("@")[0] == other.partition("@")[0] == "own.Own "
 
 
 def test_name_has_what_a_part_was_made_with():
     """Claim: parts of one class with other numbers, or other arrays, have other names; plain
     numbers are shown."""
     one, two = own_parts.name(Mine()), own_parts.name(Mine(share=0.5))
-    assert one.startswith(f"{__name__}.Mine(share=0.2)@")
-    assert two.startswith(f"{__name__}.Mine(share=0.5)@")
+    assert one.startswith(f"{__name__}.Mine(share=0.2) @")
+    assert two.startswith(f"{__name__}.Mine(share=0.5) @")
     tables = [own_parts.name(Mine(table=np.full(3, value))) for value in (0, 0, 1)]
     assert len({one, two, *tables}) == 4
     assert own_parts.name(Child()).partition("@")[2] != one.partition("@")[2]
-    assert own_parts.name(Net()).startswith(f"{__name__}.Net(width=4, stride=2)@")
+    assert own_parts.name(Net()).startswith(f"{__name__}.Net(width=4, stride=2) @")
     assert Parts(Mine(), Net()).names() == f"sampler {one}; network {own_parts.name(Net())}"
     assert Parts().names() == ""
 
