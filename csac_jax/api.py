@@ -20,7 +20,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor, policies, rollout
 from csac_jax.io import files, leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
-from csac_jax.runtime import cache, cluster, provenance, signals
+from csac_jax.runtime import cache, cluster, provenance, short, signals
 from csac_jax.section import require
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
@@ -44,6 +44,9 @@ class Run(NamedTuple):
     cfg: Config
     summary: Summary
     parts: dict[str, Any]  # the network and learner given, as `load_policy` takes them
+
+    def __repr__(self) -> str:
+        return short.text(self)
 
     @property
     def policy(self) -> policies.Policy:

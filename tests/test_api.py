@@ -17,19 +17,21 @@ from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import monitor
+from csac_jax.evaluation import monitor, policies, suites
 from csac_jax.io import checkpoint, configs, files, policy_file
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
 from csac_jax.training import own_parts, programs, step
-from csac_jax.training.callbacks import Record
+from csac_jax.training.callbacks import Record, Summary
 from csac_jax.vision.heightmap import Observation
 from examples.own_learner import QLearner
 from examples.own_network import PlainNet
 
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
+
+SUMMARY = Summary(4, 8, 1.5, 0.5, None, 0, None)
 
 
 def test_public_names_exist():
@@ -38,6 +40,25 @@ def test_public_names_exist():
         assert getattr(csac_jax, name).__doc__, name
     assert set(csac_jax.__all__) < set(dir(csac_jax))
     assert not hasattr(csac_jax, "make_robot")
+
+
+def test_public_objects_have_short_texts():
+    """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
+    cfg, key = SMOKE, jax.random.key(0)
+    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped")
+    state = jax.jit(env.reset)(key)
+    arms = [kind(cfg) for kind in policies.BASELINES.values()]
+    objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned, *arms]
+    objects += [csac_jax.deploy.CameraPolicy.load("shipped"), policies.PlannerPolicy(cfg, learned)]
+    objects += [learned.debug(state, key), suites.prepare(cfg, "in_distribution", 2)]
+    objects += [api.Run(Path("run"), cfg, SUMMARY, {})]
+    texts = list(map(repr, objects))
+    assert [text for text in texts if len(text) > 400 or "\n" in text] == []
+    params = jax.tree.leaves(learned.params)
+    numbers = sum(leaf.size for leaf in params)
+    named = f"cfg=<fast, csac_beta, seed 0>, params=<{len(params)} arrays, {numbers:,} numbers>"
+    assert repr(learned) == f"NetworkPolicy({named})"
+    assert "reward=0.0, terminated=False" in repr(state)
 
 
 def test_import_leaves_jax_alone():

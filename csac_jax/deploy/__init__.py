@@ -24,7 +24,7 @@ from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import CameraView
 from csac_jax.errors import SettingsError
 from csac_jax.io import policy_file
-from csac_jax.runtime import cache
+from csac_jax.runtime import cache, short
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import depth_camera
 from csac_jax.vision.heightmap import Observation
@@ -52,6 +52,8 @@ class CameraPolicy:
     cfg: Config
     params: Params
     workspace_pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))  # to robot
+
+    __repr__ = short.text
 
     @classmethod
     def load(

@@ -20,7 +20,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
-from csac_jax.runtime import modules
+from csac_jax.runtime import modules, short
 from csac_jax.section import require
 from csac_jax.training import own_parts, programs
 from csac_jax.vision import heightmap
@@ -49,6 +49,9 @@ class PolicyDebug(NamedTuple):
     candidates: jax.Array  # [P, J, 3] m, m, rad: the poses of the last CEM round
     best_grasp: jax.Array  # [] phi_g of CSAC eq. 16, by the critic that acts
 
+    def __repr__(self) -> str:
+        return short.text(self)
+
 
 @struct.dataclass
 class NetworkPolicy:
@@ -58,6 +61,8 @@ class NetworkPolicy:
     cfg: Config = struct.field(pytree_node=False)
     params: actor_critic.Params
     network: Any = struct.field(pytree_node=False, default=None)  # a custom critic
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -102,6 +107,8 @@ class CustomLearnerPolicy:
     learner: Learner = struct.field(pytree_node=False)
     state: Any
 
+    __repr__ = short.text
+
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
         obs, unchanged, _ = _alone(_seen(scene))
@@ -113,6 +120,8 @@ class RandomPolicy:
     """Random grasps, above a block unless `policy.action_mask` is `none`."""
 
     cfg: Config = struct.field(pytree_node=False)
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -126,6 +135,8 @@ class OraclePolicy:
     blocks it holds."""
 
     cfg: Config = struct.field(pytree_node=False)
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -144,6 +155,8 @@ class GeometricPolicy:
 
     cfg: Config = struct.field(pytree_node=False)
     weights: antipodal.Weights = antipodal.Weights()
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -165,6 +178,8 @@ class PlannerPolicy:
     cfg: Config = struct.field(pytree_node=False)
     proposer: NetworkPolicy | None = None
     budget: planner.Budget = planner.Budget()
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:

@@ -226,10 +226,11 @@ def provenance(report: ResultReport) -> ResultTable:
     files = {run.path: (train_command(run.config), run.record) for run in report.results.runs}
     for one in report.results.evaluations:
         files[one.path] = one.command(trained.get(one.path.parent)), one.record
-    root = os.path.commonpath([path.parent for path in files]) if files else ""
+    folders = [path.parent.absolute() for path in files]  # one form: some are given relative
+    root = os.path.commonpath(folders) if files else ""
     return [
         {
-            "file": os.path.relpath(path, root),
+            "file": os.path.relpath(path.absolute(), root),
             "settings as a command": command,
             "device": record.get("device") or "-",
             "versions": _versions(record) or "-",

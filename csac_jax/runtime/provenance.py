@@ -64,6 +64,6 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 def record() -> dict[str, object]:
     """Returns device, versions and commit, for a result's JSON, and modules of one's own."""
-    known = {"device": device(), "versions": versions(), "commit": commit()}
+    known: dict[str, object] = {"device": device(), "versions": versions(), "commit": commit()}
     own = modules.digests()
     return {**known, "modules": own} if own else known

@@ -146,6 +146,10 @@ def test_own_parts_are_other_variants(tmp_path: Path):
     assert commands["a/seed-0/metrics.jsonl"].endswith(by)
     assert "parts" not in commands["a/seed-0/eval.json"]
     assert " by " not in commands["plain/seed-0/metrics.jsonl"]
+    both = _report(tmp_path / "plain", tmp_path / "b")
+    charts = {chart.name: chart.figure for chart in figures.draw(both)}
+    legend = charts["variants-paper"].axes[0].get_legend()
+    assert legend.get_texts()[0].get_text() == "CSAC-beta (2)"
 
 
 def test_numbers_as_json(recorded: Path):
@@ -482,6 +486,30 @@ def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.
     printed = capsys.readouterr().out
     assert (out / "results.md").read_text() in printed
     assert len(json.loads(numbers.read_text())["curves"]) == 3
+
+
+def test_page_is_a_file_or_a_folder(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: `--out` of a name in .html writes that file, and of another name a folder. What is
+    there as the other kind is one line, and so are relative and absolute runs together read."""
+    monkeypatch.chdir(recorded)
+    assert cli.main(["report", "vpg", str(recorded / "beta"), "--out", "new/page.html"]) == 0
+    text = capsys.readouterr().out
+    assert "| vpg/metrics.jsonl |" in text
+    assert "| beta/seed-0/metrics.jsonl |" in text
+    assert Path("new/page.html").read_text().startswith("<!doctype html>")
+    assert cli.main(["report", "vpg", "--out", "new"]) == 0
+    assert {path.name for path in Path("new").iterdir()} == {
+        "page.html",
+        "index.html",
+        "results.md",
+    }
+    Path("folder.html").mkdir()
+    capsys.readouterr()
+    for out, message in (("folder.html", "is a folder"), ("new/results.md", "is a file")):
+        assert cli.main(["report", "vpg", "--out", out]) == 2
+        assert f"--out: {out} {message}; name another" in capsys.readouterr().err
 
 
 def test_reads_without_jax(recorded: Path):
