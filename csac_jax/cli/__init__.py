@@ -26,6 +26,7 @@ from csac_jax.cli import (
     output,
     parsing,
     play,
+    policies,
     report,
     scenes,
     serve,
@@ -46,6 +47,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "sweep": sweep.run,
     "eval": evaluate.run,
     "play": play.run,
+    "policies": policies.run,
     "calibrate": calibrate.run,
     "act": act.run,
     "serve": serve.run,
@@ -67,6 +69,7 @@ A robot learns to push and grasp in clutter.
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or one that is shipped
+  policies           list the policies that are shipped, and what each is for
   play               run one episode, as text, picture and video
   calibrate          find the camera's pose by a printed board
   act POLICY         decide where to grasp or push in a camera's image
