@@ -82,7 +82,8 @@ def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
     shrink = 1.0 + _Z**2 / worth
     middle = (share + 0.5 * _Z**2 / worth) / shrink
     half = _Z * np.sqrt(share * (1.0 - share) / worth + (0.5 * _Z / worth) ** 2) / shrink
-    low, high = min(share, middle - half), max(share, middle + half)  # rounding, at 0 and 1
+    # Rounding would leave 0 .. 1, or the value outside.
+    low, high = max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))
     return {"value": share, "low": float(low), "high": float(high), "n": n}
 
 

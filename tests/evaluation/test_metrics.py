@@ -9,6 +9,14 @@ from csac_jax.evaluation import metrics
 from csac_jax.evaluation.metrics import Episodes
 
 
+def test_intervals_stay_within_their_bounds():
+    """Claim: an interval of a share lies in 0 .. 1, exactly, and holds its value."""
+    for n in range(1, 400):
+        for lifted in (0, n):
+            share = metrics.wilson(lifted, n)
+            assert 0.0 <= share["low"] <= share["value"] <= share["high"] <= 1.0
+
+
 @pytest.mark.parametrize(
     ("successes", "n"), [(0, 1), (1, 1), (0, 50), (50, 50), (1, 7), (47, 50), (1234, 4321)]
 )

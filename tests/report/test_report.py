@@ -465,6 +465,17 @@ def test_figures(recorded: Path):
     assert (list(map(len, colours)), len(set(colours[1]))) == ([6, 3], 3)
 
 
+def test_methods_of_a_figure_have_colours_of_their_own():
+    """Claim: as many methods as a figure has are of different colours, an algorithm's first variant
+    of the same one everywhere."""
+    own = ["own learner", "mine", "another", "random", "geometric", "oracle"]
+    for methods in ([*variants.NAMES, *own], ["csac_beta"] * 12, [*own, "vpg", "vpg"]):
+        colours = figures._colours(methods)
+        assert len(set(colours)) == len(colours)
+        for algo in set(methods) & set(variants.NAMES):
+            assert colours[methods.index(algo)] == figures.COLOURS[algo]
+
+
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: `report --out` writes one page with its figures and media inside, and the tables as
     text; `--json` the numbers."""
