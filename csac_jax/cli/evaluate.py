@@ -20,6 +20,7 @@ from csac_jax.runtime import modules, processes, signals
 from csac_jax.section import require
 
 EPISODES = 50  # of every part of a suite, where neither --episodes nor --out is given
+WORST = 12  # objects that are printed; the result has all
 TABLE = "table.md"  # in the folder --out
 
 
@@ -259,6 +260,19 @@ def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
     return show
 
 
+def _print_objects(objects: dict[str, Any]) -> None:
+    """Prints the WORST objects, by the share of their episodes at whose end they were gone."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shares = sorted(objects.items(), key=lambda item: item[1]["gone"] / item[1]["episodes"])
+    title = f"objects that stayed most often, of {len(objects)}"
+    table = Table("object", "gone", "episodes", title=title)
+    for name, entry in shares[:WORST]:
+        table.add_row(name, str(entry["gone"]), str(entry["episodes"]))
+    Console(highlight=False).print(table)
+
+
 def print_summary(title: str, summary: dict[str, Any]) -> None:
     """Prints every metric, and a dash for one without cases."""
     from rich.console import Console
@@ -275,5 +289,7 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
             table.add_row(name, result_tables.shown(metric=name, band=band), str(entry["n"]))
     console = Console(highlight=False)
     console.print(table)
+    if "objects" in summary:
+        _print_objects(summary["objects"])
     for name in ("outcomes", "counts"):
         console.print(f"{name}:", ", ".join(f"{key} {n}" for key, n in summary[name].items()))

@@ -1,6 +1,7 @@
 """`csac-jax eval` over several suites."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,16 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
     assert cli.main(["eval", "shipped", *flags.split()]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
+    """Claim: of a suite of objects the summary has a table by object, those first that stayed most
+    often, and no more than 12."""
+    objects = {f"cup{i}": {"episodes": 20, "gone": i} for i in range(20)}
+    evaluate.print_summary("pile", {"outcomes": {}, "counts": {}, "objects": objects})
+    printed = capsys.readouterr().out
+    assert "objects that stayed most often, of 20" in " ".join(printed.split())
+    assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
 
 
 @pytest.mark.mjx
