@@ -28,6 +28,7 @@ from experiments import index
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 ROBOT, OBJECTS, GRIPPERS = (DOCS / name for name in ("robot.md", "objects.md", "grippers.md"))
+EXTEND = DOCS / "how-to" / "extend.md"
 COMPARE = DOCS / "how-to" / "compare-my-part.md"
 ALL = [README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("**/*.md"))]
 PAGES = [
@@ -314,11 +315,27 @@ def test_pages_and_sentences_are_short(page: Path):
     assert len(page.read_text().split()) <= WORDS.get(page.name, 5000)
 
 
+def _named(page: Path) -> set[str]:
+    return set(re.findall(r"`([\w./]+/[\w./]+)`", page.read_text()))
+
+
 def test_contributing_names_files_that_exist():
-    """Claim: the files that CONTRIBUTING tells to change are there."""
-    named = set(re.findall(r"`([\w./]+/[\w./]+)`", (ROOT / "CONTRIBUTING.md").read_text()))
-    assert len(named) > 15
+    """Claim: the files that CONTRIBUTING and its page tell to change are there."""
+    named = _named(ROOT / "CONTRIBUTING.md") | _named(EXTEND)
+    assert len(named) > 40
     assert not [path for path in named if "NAME" not in path and not (ROOT / path).exists()]
+
+
+def test_every_module_that_tells_primitives_apart_is_named():
+    """Claim: the page on a new primitive names every module that compares pushes and grasps."""
+    sources = (ROOT / "csac_jax").rglob("*.py")
+    compare = re.compile(r"Primitive\.(PUSH|GRASP)")
+    found = [path for path in sources if compare.search(path.read_text())]
+    text = EXTEND.read_text()
+    assert len(found) > 15
+    names = {path.relative_to(ROOT).as_posix() for path in found}
+    names -= {f"csac_jax/baselines/{name}.py" for name in ("antipodal", "oracle")}  # in one row
+    assert not [name for name in names if name not in text]
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ class OraclePolicy:
 
 @struct.dataclass
 class GeometricPolicy:
-    """Antipodal grasps from the height map's edges, without networks; see `agent.antipodal`."""
+    """Antipodal grasps from the height map's edges, without networks; see `baselines.antipodal`."""
 
     cfg: Config = struct.field(pytree_node=False)
     weights: antipodal.Weights = antipodal.Weights()
