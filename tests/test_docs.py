@@ -30,12 +30,11 @@ README, DOCS = ROOT / "README.md", ROOT / "docs"
 ROBOT, OBJECTS, GRIPPERS = (DOCS / name for name in ("robot.md", "objects.md", "grippers.md"))
 EXTEND = DOCS / "how-to" / "extend.md"
 COMPARE = DOCS / "how-to" / "compare-my-part.md"
-ALL = [README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("**/*.md"))]
-PAGES = [
-    page
-    for page in ALL
-    if "```python" in page.read_text() and page not in (ROBOT, OBJECTS, COMPARE)
-]
+AGENTS, LEARNER = ROOT / "AGENTS.md", DOCS / "how-to" / "own-jax-learner.md"
+ROOTS = [README, AGENTS, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
+ALL = [*ROOTS, *sorted(DOCS.glob("**/*.md"))]
+WHOLE = (ROBOT, OBJECTS, COMPARE, LEARNER)  # that have tests of their own
+PAGES = [page for page in ALL if "```python" in page.read_text() and page not in WHOLE]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 PROGRAMS = ("csac-jax", "make", "pip", "python", "jupyter", "source", "srun")
@@ -284,6 +283,26 @@ def test_compare_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 @pytest.mark.mjx
+@pytest.mark.optax
+def test_learner_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: PPO of the page has at most 75 lines, and trains two seeds in one program, which
+    differ; blocks per action are shares."""
+    monkeypatch.chdir(tmp_path)
+    small = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setattr(presets, "quick", lambda: small)
+    learner, run = fenced(LEARNER, "python")
+    assert len(learner.splitlines()) <= 75
+    namespace: dict[str, Any] = {"__name__": "page"}
+    exec(compile(learner, "page", "exec"), namespace)
+    with jax.debug_key_reuse(False):
+        exec(compile(run.replace("100, 4", "2, 2"), "page", "exec"), namespace)
+    curves = namespace["curves"]
+    assert curves.shape == (2, 2)
+    assert 0.0 <= curves.min() <= curves.max() <= 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
 def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/objects.md run in their order, given a folder
     of meshes in millimetres."""
@@ -317,6 +336,16 @@ def test_pages_and_sentences_are_short(page: Path):
 
 def _named(page: Path) -> set[str]:
     return set(re.findall(r"`([\w./]+/[\w./]+)`", page.read_text()))
+
+
+def test_pages_for_assistants_are_short_and_lead_somewhere():
+    """Claim: AGENTS.md has at most 60 lines; the paths that it and llms.txt name are there."""
+    assert len(AGENTS.read_text().splitlines()) <= 60
+    index = (ROOT / "llms.txt").read_text()
+    linked = re.findall(r"\]\(([^)]+)\)", index)
+    assert len(linked) > 15
+    assert not [path for path in [*linked, *_named(AGENTS)] if not (ROOT / path).exists()]
+    assert index.startswith("# csac_jax\n\n> ")
 
 
 def test_contributing_names_files_that_exist():

@@ -231,7 +231,7 @@ def provenance(report: ResultReport) -> ResultTable:
     return [
         {
             "file": os.path.relpath(path.absolute(), root),
-            "settings as a command": command,
+            "settings as a command": command + _imports(record),
             "device": record.get("device") or "-",
             "versions": _versions(record) or "-",
             "commit": str(record.get("commit") or "-")[:10],
@@ -239,6 +239,10 @@ def provenance(report: ResultReport) -> ResultTable:
         }
         for path, (command, record) in files.items()
     ]
+
+
+def _imports(record: Json) -> str:
+    return "".join(f" --import {module}" for module in record.get("modules") or {})
 
 
 def _versions(record: Json) -> str:

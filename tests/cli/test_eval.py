@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from csac_jax import cli
 from csac_jax.cli import evaluate
+from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.report import suite_table
 
@@ -93,6 +95,22 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
     assert cli.main(["eval", "shipped", *flags.split()]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: each suite is measured with the modules of --import, in a process of its own too."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    Path("my_empty.py").write_text("")
+    tasks: list[tuple] = []
+    monkeypatch.setattr(evaluate.processes, "each", lambda _, some, *__: tasks.extend(some))
+    flags = ["--policy", "random", "--suites", "cases", "tray", "--out", "out"]
+    assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 0
+    assert all("my_empty" in task[-1] for task in tasks)
+    assert len(tasks) == 2
+    options, changes, suite, episodes, _ = tasks[0]
+    with pytest.raises(SettingsError, match="'no_module' cannot be imported"):
+        evaluate._measure(lambda *_: None, options, changes, suite, episodes, ("no_module",))
 
 
 def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):

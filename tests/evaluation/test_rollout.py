@@ -298,6 +298,7 @@ def test_policies_say_what_they_were_not_made_for(
     monkeypatch.setattr(rollout, "rollout", lambda *_: None)
     monkeypatch.setattr(rollout.metrics, "summarise", lambda _: {})
     monkeypatch.setattr(rollout.object_slots, "fingerprint", lambda *_: "")
+    monkeypatch.setattr(rollout, "_by_object", lambda *_: {})
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         rollout.evaluate(RandomPolicy(cfg), suite)

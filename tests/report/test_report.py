@@ -124,6 +124,18 @@ def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
     assert values == {10: [0.5] * 2, 40: [0.9] * 2}
 
 
+def test_command_loads_the_modules(tmp_path: Path):
+    """Claim: a recorded command loads the modules of one's own that the run or evaluation had."""
+    own = {"modules": {"mine": "0123456789ab"}}
+    _run(tmp_path / "a", _config("vpg", 0), [0.5], own)
+    _evaluation(tmp_path / "a" / "eval.json", _config("vpg", 0), 5)
+    content = json.loads((tmp_path / "a" / "eval.json").read_text()) | own
+    (tmp_path / "a" / "eval.json").write_text(json.dumps(content))
+    rows = result_tables.provenance(_report(tmp_path))
+    assert len(rows) == 2
+    assert all(row["settings as a command"].endswith(" --import mine") for row in rows)
+
+
 def test_own_parts_are_other_variants(tmp_path: Path):
     """Claim: runs and evaluations with parts of one's own are named by them and not pooled with
     others of the same config; with a learner of one's own no algorithm is named. Their command says
