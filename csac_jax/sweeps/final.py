@@ -48,7 +48,12 @@ def measure(
 
 
 def _measure_point(
-    episodes: int, suite: str, cfg: Config, left: dict[Path, Config], stop: Stop, own: Parts
+    episodes: int,
+    suite: str,
+    cfg: Config,
+    left: dict[Path, Config],
+    stop: Stop,
+    own: Parts = NO_PARTS,
 ) -> None:
     """Evaluates runs of one point, which share scenes and compiled episodes.
 

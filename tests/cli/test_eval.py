@@ -103,9 +103,14 @@ def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("sys.path", [*sys.path])
     Path("my_empty.py").write_text("")
     tasks: list[tuple] = []
-    monkeypatch.setattr(evaluate.processes, "each", lambda _, some, *__: tasks.extend(some))
+
+    def stopped(_: Any, some: list[tuple], *__: Any) -> None:
+        tasks.extend(some)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate.processes, "each", stopped)
     flags = ["--policy", "random", "--suites", "cases", "tray", "--out", "out"]
-    assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 0
+    assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 130
     assert all("my_empty" in task[-1] for task in tasks)
     assert len(tasks) == 2
     options, changes, suite, episodes, _ = tasks[0]
