@@ -4,12 +4,15 @@ A name has the class with its module, the numbers that it was made with, and a d
 `sampler my_module.Mine(share=0.2) @3f2a9c0145de`. So runs with other parts are other runs.
 """
 
+import contextlib
 import dataclasses
 import hashlib
 import inspect
 import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from csac_jax.agent.learner import Learner
 from csac_jax.config import Config
@@ -77,24 +80,33 @@ def _digest(part: Any) -> str:
 
 def _content(value: Any) -> str:
     """Describes a value, the same in every process: no text has an address."""
+    if value is None or _is_plain(value):
+        return repr(value)
+    if isinstance(value, dict):
+        value = sorted((str(key), _content(item)) for key, item in value.items())
     if isinstance(value, tuple | list):
         return f"[{', '.join(map(_content, value))}]"
-    if hasattr(value, "__array__"):
-        array = value.__array__()
+    if inspect.isfunction(value):
+        return _source(value)
+    kind = type(value).__qualname__
+    if dataclasses.is_dataclass(value):
+        return f"{kind}{_content(_fields(value))}"
+    with contextlib.suppress(AttributeError, TypeError):  # no array, or one of keys
+        array = np.asarray(value.__array__())
         return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
-    plain = value is None or _is_plain(value)
-    return repr(value) if plain else str(getattr(value, "__qualname__", type(value).__qualname__))
+    return kind
 
 
 def _is_library(kind: type) -> bool:
     return kind.__module__.partition(".")[0] in LIBRARIES
 
 
-def _source(kind: type) -> str:
+def _source(of: Any) -> str:
+    """Returns the source of a class or function; its name if it was typed into an interpreter."""
     try:
-        return inspect.getsource(kind)
-    except (OSError, TypeError):  # typed into an interpreter
-        return kind.__qualname__
+        return inspect.getsource(of)
+    except (OSError, TypeError):
+        return of.__qualname__
 
 
 def check(parts: Parts, init: Any = None) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
+import jax
 import numpy as np
 import pytest
 
@@ -26,6 +27,14 @@ class Mine(csac.Sampler):
     table: Any = None
 
     def sample(self, key: Any, state: Any, progress: Any, num: int) -> Any: ...
+
+
+def _same(x: float) -> float:
+    return x
+
+
+def _other(x: float) -> float:
+    return -x
 
 
 class Child(Mine):
@@ -71,6 +80,11 @@ def test_name_has_what_a_part_was_made_with():
     assert two.startswith(f"{__name__}.Mine(share=0.5) @")
     tables = [own_parts.name(Mine(table=np.full(3, value))) for value in (0, 0, 1)]
     assert len({one, two, *tables}) == 4
+    held = [{"a": 1}, {"a": 2}, {"b": 1}, (1, [2]), (1, [3]), Mine(), Mine(0.5), jax.random.key(0)]
+    held += [_same, _other, np.float32(1.0), np.float32(2.0), object(), None]
+    names = [own_parts.name(Mine(table=value)) for value in held]
+    assert len(set(names)) == len(held)
+    assert names == [own_parts.name(Mine(table=value)) for value in held]
     assert own_parts.name(Child()).partition("@")[2] != one.partition("@")[2]
     assert own_parts.name(Net()).startswith(f"{__name__}.Net(width=4, stride=2) @")
     assert Parts(Mine(), Net()).names() == f"sampler {one}; network {own_parts.name(Net())}"
