@@ -382,16 +382,20 @@ def test_sweep_decides_on_physics(sweeps: list[Any], monkeypatch: pytest.MonkeyP
 
 @pytest.mark.mjx
 def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, monkeypatch):
-    """Claim: `init` is where each run of a sweep starts from, the learners of all groups."""
+    """Claim: `init` is where each run of a sweep starts from, the learners of all groups; parts of
+    one's own are in every group's program."""
+    mine = Newest()
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
     given = []
+    made = api.replicas.sweep_program
     monkeypatch.setattr(api.replicas, "sweep_program", lambda *args: given.append(args))
-    api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", verbose=False)
+    api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", sampler=mine, verbose=False)
     ((plan, _, make_program, _),) = sweeps
     (group,) = group_configs([dataclasses.replace(plan.points[0].cfg, seed=k) for k in range(2)])
     make_program(group)
     ((asked, mesh, shard, start, own),) = given
-    assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.NO_PARTS)
+    assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.Parts(mine))
+    assert made(group, own=own).program.sampler is mine
     _assert_same(start(_learner_state(SMOKE)).online, params)
 
 

@@ -156,6 +156,7 @@ def test_own_parts_are_other_variants(tmp_path: Path):
     commands = {row["file"]: row["settings as a command"] for row in rows}
     by = ", by csac_jax.train with sampler my.Mine @0123456789ab"
     assert commands["a/seed-0/metrics.jsonl"].endswith(by)
+    assert "parts" not in commands["a/seed-0/metrics.jsonl"]  # no option makes them
     assert "parts" not in commands["a/seed-0/eval.json"]
     assert " by " not in commands["plain/seed-0/metrics.jsonl"]
     both = _report(tmp_path / "plain", tmp_path / "b")
