@@ -182,6 +182,10 @@ def compile_program(
     reporter.log("compiling the training program; this takes a while, once")
     if cfg.sim.physics == "warp":
         reporter.log("then Warp builds its kernels, on a new machine for minutes")
+    if cfg.sim.physics == "mjx" and jax.default_backend() == "cpu":
+        reporter.log(
+            "MJX compiles for minutes on a CPU; physics c or auto does not: --sim.physics c"
+        )
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun
