@@ -295,7 +295,7 @@ def test_learner_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     namespace: dict[str, Any] = {"__name__": "page"}
     exec(compile(learner, "page", "exec"), namespace)
     with jax.debug_key_reuse(False):
-        exec(compile(run.replace("100, 4", "2, 2"), "page", "exec"), namespace)
+        exec(compile(run.replace("20, 2", "2, 2"), "page", "exec"), namespace)
     curves = namespace["curves"]
     assert curves.shape == (2, 2)
     assert 0.0 <= curves.min() <= curves.max() <= 1.0
