@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import functools
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,14 +18,16 @@ from csac_jax.config import Config, DenseNet121, SmallNet
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import monitor, policies, rollout
-from csac_jax.io import leaves, lock, policy_file, weights
+from csac_jax.io import files, leaves, lock, policy_file, weights
 from csac_jax.replay.samplers import Sampler
-from csac_jax.runtime import cache, cluster, provenance, signals
+from csac_jax.runtime import cache, cluster, provenance, short, signals
+from csac_jax.section import require
 from csac_jax.sim import backend
 from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
-from csac_jax.training import loop, memory, programs, sharding, split_step
-from csac_jax.training.callbacks import Callback, FunctionCallback, Record, Summary
+from csac_jax.training import loop, memory, own_parts, programs, sharding, split_step
+from csac_jax.training.callbacks import Callback, FunctionCallback, Record, RunRecord, Summary
+from csac_jax.training.own_parts import Parts
 from csac_jax.training.progress import Terminal
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -41,6 +44,9 @@ class Run(NamedTuple):
     cfg: Config
     summary: Summary
     parts: dict[str, Any]  # the network and learner given, as `load_policy` takes them
+
+    def __repr__(self) -> str:
+        return short.text(self)
 
     @property
     def policy(self) -> policies.Policy:
@@ -72,14 +78,17 @@ def train(
     checkpoint to resume from, by default the newest sound one. init, networks to start from:
     "shipped", a run's folder, a policy file, or torchvision's weights of DenseNet-121 as
     .safetensors. sampler, network (a Flax module, see `nets.networks`) and learner: parts of your
-    own, which a resumed run needs again. callbacks, each a `Callback` or a function of the `Record`
-    of each chunk. eval_every, actions between evaluations in eval_episodes episodes of eval_suite,
-    see `evaluate`, with the best state saved, see `load_policy`; a resumed run continues them.
+    own, which the run's config names and a resumed run needs again. callbacks, each a `Callback` or
+    a function of the `Record` of each chunk. eval_every, actions between evaluations in
+    eval_episodes episodes of eval_suite, see `evaluate`, with the best state saved, see
+    `load_policy`; a resumed run continues them.
     Raises SettingsError for settings that do not fit, FileExistsError for a folder that exists,
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
     """
-    cfg = backend.resolve(cfg)
+    own = Parts(sampler, network, learner)
+    own_parts.check(own, init)
+    cfg = own_parts.named(backend.resolve(cfg), own)
     memory.check(cfg)
     folder = new_folder(f"{cfg.preset}-{cfg.seed}") if run_dir is None else Path(run_dir)
     if resume:
@@ -92,9 +101,9 @@ def train(
     cache.enable()
     with Terminal(Console(quiet=not verbose)) as terminal:
         terminal.log(_first_line(folder, cfg))
-        program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
-        cached = (learner, sampler, network) == (None, None, None)
+        program = programs.make(cfg, **own._asdict())
         called = [one if isinstance(one, Callback) else FunctionCallback(one) for one in callbacks]
+        called.append(RunRecord())
         if plan is not None:
             policy = lambda state: policies.policy_from_state(cfg, state, network, learner)  # noqa: E731
             called.append(monitor.Monitor(cfg, plan, policy, called[:], terminal.log))
@@ -105,7 +114,9 @@ def train(
             programs.prepare(program)
             return state if start is None else state.replace(learner=start(state.learner))
 
-        compile_chunk = functools.partial(split_step.compile_chunk, program, cached=cached)
+        compile_chunk = functools.partial(
+            split_step.compile_chunk, program, cached=own == own_parts.NO_PARTS
+        )
         stop = stop or signals.Stop()
         summary = loop.run(
             cfg, folder, first_state, compile_chunk, terminal, stop, resume, at, called
@@ -125,8 +136,10 @@ def train_fn(
     It does all steps of `train` with `jax.random.key(seed)`, without log or checkpoint, in any
     physics. Jit it, and vmap it over keys: `jax.jit(jax.vmap(train_fn(cfg)))(keys)`. T = steps.
     """
-    cfg = backend.resolve(cfg)
-    program = programs.make(cfg, learner=learner, sampler=sampler, network=network)
+    own = Parts(sampler, network, learner)
+    own_parts.check(own)
+    cfg = own_parts.named(backend.resolve(cfg), own)
+    program = programs.make(cfg, **own._asdict())
 
     def run(key: jax.Array) -> tuple[TrainState, StepMetrics]:
         return programs.run_steps(program, loop.total_steps(cfg), programs.init_state(program, key))
@@ -143,7 +156,11 @@ def sweep(
     devices: int | None = None,
     shard: sharding.Shard = "seeds",
     init: str | Path | None = None,
+    sampler: Sampler | None = None,
+    network: Any = None,
+    learner: Learner | None = None,
     episodes: int = 0,
+    resume: bool = False,
     verbose: bool = True,
     stop: signals.Stop | None = None,
 ) -> dict[str, Any]:
@@ -151,17 +168,23 @@ def sweep(
 
     Args: seeds, cfg.seed and those after it. vary, values by dotted setting, "algo" or "task", as
     in {"learn.tau": (0.01, 0.02)}. run_dir, a folder that does not exist. devices, how many to use;
-    shard, what they divide: the seeds, or the scenes of each seed. episodes, that every final
-    policy is evaluated in. Returns: the summary, grasp success of every combination over its seeds
-    with 95 % intervals. Raises as `train`.
+    shard, what they divide: the seeds, or the scenes of each seed. sampler, network, learner: parts
+    of your own, see `train`. episodes, that every final policy is evaluated in. resume, continues
+    the sweep in run_dir, which has the same settings. Returns: the summary, grasp success of every
+    combination over its seeds with 95 % intervals. Raises as `train`.
     """
-    plan = SweepPlan(seeds, _points(cfg, dict(vary or {})), episodes)
+    own = Parts(sampler, network, learner)
+    own_parts.check(own, init)
+    own_parts.check_varied(own, vary or {})
+    plan = SweepPlan(seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes)
     runner.check_plan(plan)
     room = devices or 1, seeds * len(plan.points)
     points = [point._replace(cfg=backend.resolve(point.cfg, *room)) for point in plan.points]
     plan, stop = plan._replace(points=points), stop or signals.Stop()
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
-    return run_sweep(plan, folder, devices, shard, init, verbose, stop).summary
+    same = not resume or runner.read_plan(folder) == plan
+    require(same, f"resume: {folder} is a sweep of other settings, parts or seeds; give the same")
+    return run_sweep(plan, folder, devices, shard, init, verbose, stop, resume, own).summary
 
 
 def run_sweep(
@@ -173,8 +196,12 @@ def run_sweep(
     verbose: bool,
     stop: signals.Stop,
     resume: bool = False,
+    own: Parts = own_parts.NO_PARTS,
 ) -> SweepResult:
-    """Runs what is left of a sweep's plan, see `sweep`."""
+    """Runs what is left of a sweep's plan, see `sweep`, and writes its record."""
+    begun = time.time()
+    for point in plan.points:
+        own_parts.named(point.cfg, own)
     cache.enable()
     mesh = sharding.make(devices)
     for cfg in (point.cfg for point in plan.points):
@@ -184,18 +211,23 @@ def run_sweep(
 
     def make_program(group: replicas.ProgramGroup) -> replicas.SweepProgram:
         start = initial_networks(group.configs[0], init)
-        return replicas.sweep_program(group, mesh, shard, start)
+        return replicas.sweep_program(group, mesh, shard, start, own)
 
     with Terminal(Console(quiet=not (verbose and cluster.is_first()))) as terminal:
         terminal.log(f"sweep {folder}")
         result = runner.run(plan, folder, make_program, terminal, stop, resume=resume)
-        if result.stopped_by is not None or not plan.episodes or not cluster.is_first():
-            return result
-        with lock.exclusive(folder):
-            stopped = final.measure(plan, folder, terminal, stop)
-        if stopped is not None:
-            terminal.log(f"stopped; continue with: csac-jax sweep --resume {folder}")
-        return result._replace(stopped_by=stopped)
+        if result.stopped_by is None and plan.episodes and cluster.is_first():
+            with lock.exclusive(folder):
+                stopped = final.measure(plan, folder, terminal, stop, own=own)
+            if stopped is not None:
+                terminal.log(f"stopped; continue with: csac-jax sweep --resume {folder}")
+            result = result._replace(stopped_by=stopped)
+    if cluster.is_first():
+        end = {"run_dir": str(folder), **result.summary, **result._asdict()}
+        del end["summary"]
+        seconds = {"wall_seconds": round(time.time() - begun, 1)}
+        files.write_json(folder / files.RECORD, end | seconds | provenance.record())
+    return result
 
 
 def evaluate_sweep(folder: Path, suite: str, episodes: int, stop: signals.Stop) -> int | None:
@@ -269,6 +301,7 @@ def _points(cfg: Config, vary: dict[str, Sequence[Any]]) -> list[grid.SweepPoint
 
 def _first_line(folder: Path, cfg: Config) -> str:
     settings = f"preset {cfg.preset}, algorithm {cfg.algo}, seed {cfg.seed}"
+    settings += f", {cfg.parts}" if cfg.parts else ""
     scenes = f"{cfg.train.scenes} scene{'s' if cfg.train.scenes > 1 else ''}"
     return (
         f"run {folder}: {settings}, {scenes}, physics {cfg.sim.physics}, on {provenance.device()}"

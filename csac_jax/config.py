@@ -443,6 +443,7 @@ class Config(Section):
     preset: str = "quick"  # Name of the preset that this config was made from.
     algo: str = "csac_beta"  # Algorithm that was asked for; the sections say what it is made of.
     seed: int = number(0, 0, 2**31 - 1)  # Number that all randomness follows from (for every run).
+    parts: str = ""  # Parts of one's own, see `training.own_parts`; a record, which `train` writes.
     scene: SceneConfig = SceneConfig()
     task: TaskConfig = TaskConfig()
     sim: SimConfig = SimConfig()

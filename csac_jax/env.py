@@ -22,6 +22,7 @@ from csac_jax.config import Config
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.grippers import Grip, Gripper
 from csac_jax.robot.primitives import Action
+from csac_jax.runtime import short
 from csac_jax.scenes import pool
 from csac_jax.sim import backend, outcome, physics as simulation
 from csac_jax.sim.physics import Motion, Physics
@@ -81,6 +82,8 @@ class State:
     info: Info
     noise_key: jax.Array | None = None  # [] root of the episode's sensor noise; None without noise
 
+    __repr__ = short.text
+
     @property
     def done(self) -> jax.Array:
         """Returns [] bool, the episode is over."""
@@ -96,6 +99,8 @@ class Env:
     scenes: SceneState  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
     max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: no limit
+
+    __repr__ = short.text
 
     @property
     def gripper(self) -> Gripper:
@@ -228,6 +233,8 @@ class AutoResetEnv:
     """An environment whose `step` replaces a finished scene by a fresh one."""
 
     env: Env
+
+    __repr__ = short.text
 
     def reset(self, key: jax.Array) -> State:
         """Starts an episode, see `Env.reset`."""

@@ -84,4 +84,7 @@ def main(folder: str, *options: str) -> None:
 
 
 if __name__ == "__main__":
+    if not sys.argv[1:] or sys.argv[1].startswith("-"):
+        print(__doc__)
+        sys.exit(sys.argv[1:] not in (["-h"], ["--help"]))
     main(*sys.argv[1:])

@@ -12,21 +12,26 @@ import numpy as np
 import pytest
 
 import csac_jax
-from csac_jax import algorithms, api, presets
+from csac_jax import algorithms, api, cli, presets
 from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import monitor
-from csac_jax.io import checkpoint, configs, policy_file
+from csac_jax.evaluation import monitor, policies, suites
+from csac_jax.io import checkpoint, configs, files, policy_file
+from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.replicas import group_configs
 from csac_jax.sweeps.runner import SweepResult
-from csac_jax.training import programs, step
-from csac_jax.training.callbacks import Record
+from csac_jax.training import own_parts, programs, step
+from csac_jax.training.callbacks import Record, Summary
 from csac_jax.vision.heightmap import Observation
+from examples.own_learner import QLearner
+from examples.own_network import PlainNet
 
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
+
+SUMMARY = Summary(4, 8, 1.5, 0.5, None, 0, None)
 
 
 def test_public_names_exist():
@@ -35,6 +40,25 @@ def test_public_names_exist():
         assert getattr(csac_jax, name).__doc__, name
     assert set(csac_jax.__all__) < set(dir(csac_jax))
     assert not hasattr(csac_jax, "make_robot")
+
+
+def test_public_objects_have_short_texts():
+    """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
+    cfg, key = SMOKE, jax.random.key(0)
+    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped")
+    state = jax.jit(env.reset)(key)
+    arms = [kind(cfg) for kind in policies.BASELINES.values()]
+    objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned, *arms]
+    objects += [csac_jax.deploy.CameraPolicy.load("shipped"), policies.PlannerPolicy(cfg, learned)]
+    objects += [learned.debug(state, key), suites.prepare(cfg, "in_distribution", 2)]
+    objects += [api.Run(Path("run"), cfg, SUMMARY, {})]
+    texts = list(map(repr, objects))
+    assert [text for text in texts if len(text) > 400 or "\n" in text] == []
+    params = jax.tree.leaves(learned.params)
+    numbers = sum(leaf.size for leaf in params)
+    named = f"cfg=<fast, csac_beta, seed 0>, params=<{len(params)} arrays, {numbers:,} numbers>"
+    assert repr(learned) == f"NetworkPolicy({named})"
+    assert "reward=0.0, terminated=False" in repr(state)
 
 
 def test_import_leaves_jax_alone():
@@ -224,6 +248,81 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     _assert_same(state.scenes, fresh.scenes)
 
 
+@dataclasses.dataclass(frozen=True)
+class Newest(csac_jax.Sampler):
+    """The newest `share` of the ring."""
+
+    share: float = 0.5
+
+    def sample(self, key: jax.Array, state: Any, progress: jax.Array, num: int) -> csac_jax.Sample:
+        share = jnp.int32(self.share * jnp.float32(state.size))
+        slots = jax.random.randint(key, (num,), 0, jnp.maximum(share, 1), jnp.int32)
+        return csac_jax.Sample(slots, jnp.ones(num))
+
+
+@pytest.mark.mjx
+def test_run_names_its_own_parts(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: a run with a sampler of one's own names it in config, checkpoint and record. It
+    resumes with that sampler only, by the command not at all; a run without one takes none."""
+    stop, mine = Stop(), Newest()
+    stop.signal = 15  # before the first chunk
+    quiet: Any = {"stop": stop, "verbose": False}
+    run = api.train(SMOKE, tmp_path / "mine", sampler=mine, **quiet)
+    api.train(SMOKE, tmp_path / "plain", **quiet)
+    name = own_parts.Parts(mine).names()
+    assert name.startswith(f"sampler {__name__}.Newest(share=0.5) @")
+    stored = [configs.load_config(run.run_dir / "config.json"), checkpoint.load_config(run.run_dir)]
+    assert [run.cfg.parts, *(cfg.parts for cfg in stored)] == [name] * 3
+    assert files.read_object(run.run_dir / files.RECORD)["config"]["parts"] == name
+    assert api.train(SMOKE, run.run_dir, resume=True, sampler=mine, **quiet).summary.step == 0
+    for folder, other in (("mine", None), ("mine", Newest(0.2)), ("plain", mine)):
+        with pytest.raises(SettingsError, match=rf"{folder} was trained with .*; give the same$"):
+            api.train(SMOKE, tmp_path / folder, resume=True, sampler=other, **quiet)
+    assert cli.main(["train", "--resume", str(run.run_dir)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"these settings are of a run with {name}, none is given" in line
+
+
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_run_has_a_record(trained):
+    """Claim: a run of the API has the record that the command's has: its end, wall time, config,
+    device, versions and commit."""
+    run, _ = trained
+    record = files.read_object(run.run_dir / files.RECORD)
+    assert record["run_dir"] == str(run.run_dir)
+    assert record["wall_seconds"] >= record["seconds"]
+    assert configs.from_dict(record["config"]) == run.cfg
+    for known in (run.summary._asdict(), provenance.record()):
+        assert {name: record[name] for name in known} == known
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+@pytest.mark.parametrize(
+    "own", [{"sampler": Newest()}, {"network": PlainNet()}, {"learner": QLearner()}]
+)
+def test_sweep_takes_own_parts(tmp_path: Path, own: Any):
+    """Claim: a sweep with a part of one's own trains and evaluates it in each seed, beside values
+    of settings; every run names it, and the sweep resumes with it only."""
+    cfg = SMOKE.change(reward=algorithms.VPG_REWARD)
+    vary = {"reward.success_bonus": (0.0, 0.5)}
+    asked: Any = {"vary": vary, "run_dir": tmp_path / "sweep", "episodes": 2, "verbose": False}
+    summary = api.sweep(cfg, 2, **asked, **own)
+    assert summary["complete"]
+    names = own_parts.Parts(**own).names()
+    configured = list((tmp_path / "sweep").glob("*/seed-*/config.json"))
+    assert len(configured) == 4
+    assert {configs.load_config(path).parts for path in configured} == {names}
+    assert len(list((tmp_path / "sweep").glob("*/seed-*/eval.json"))) == 4
+    assert files.read_object(tmp_path / "sweep" / files.RECORD)["commit"] == provenance.commit()
+    assert api.sweep(cfg, 2, resume=True, **asked, **own) == summary
+    with pytest.raises(SettingsError, match=r"^resume: .* is a sweep of other settings, parts"):
+        api.sweep(cfg, 2, resume=True, **asked)
+    assert cli.main(["sweep", "--resume", str(tmp_path / "sweep")]) == 2
+
+
 @pytest.fixture
 def sweeps(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Any]:
     """What a sweep that trains no run is called with; folders are made in `tmp_path`."""
@@ -283,16 +382,20 @@ def test_sweep_decides_on_physics(sweeps: list[Any], monkeypatch: pytest.MonkeyP
 
 @pytest.mark.mjx
 def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, monkeypatch):
-    """Claim: `init` is where each run of a sweep starts from, the learners of all groups."""
+    """Claim: `init` is where each run of a sweep starts from, the learners of all groups; parts of
+    one's own are in every group's program."""
+    mine = Newest()
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
     given = []
+    made = api.replicas.sweep_program
     monkeypatch.setattr(api.replicas, "sweep_program", lambda *args: given.append(args))
-    api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", verbose=False)
+    api.sweep(SMOKE, 2, init=tmp_path / "policy.safetensors", sampler=mine, verbose=False)
     ((plan, _, make_program, _),) = sweeps
     (group,) = group_configs([dataclasses.replace(plan.points[0].cfg, seed=k) for k in range(2)])
     make_program(group)
-    ((asked, mesh, shard, start),) = given
-    assert (asked, mesh, shard) == (group, None, "seeds")
+    ((asked, mesh, shard, start, own),) = given
+    assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.Parts(mine))
+    assert made(group, own=own).program.sampler is mine
     _assert_same(start(_learner_state(SMOKE)).online, params)
 
 

@@ -165,7 +165,7 @@ def _fields() -> dict[str, tuple[type, dataclasses.Field]]:
                 named |= {
                     f"{name}.{field.name}": (kind, field) for field in dataclasses.fields(kind)
                 }
-        else:
+        elif name != "parts":  # a record
             named[name] = Config, Config.__dataclass_fields__[name]
     return named
 

@@ -1,5 +1,6 @@
 """README and docs: their code runs, their commands parse, their sentences are short."""
 
+import base64
 import importlib.util
 import json
 import re
@@ -27,8 +28,13 @@ from experiments import index
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 ROBOT, OBJECTS, GRIPPERS = (DOCS / name for name in ("robot.md", "objects.md", "grippers.md"))
-ALL = [README, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("**/*.md"))]
-PAGES = [page for page in ALL if "```python" in page.read_text() and page not in (ROBOT, OBJECTS)]
+EXTEND = DOCS / "how-to" / "extend.md"
+COMPARE = DOCS / "how-to" / "compare-my-part.md"
+AGENTS, LEARNER = ROOT / "AGENTS.md", DOCS / "how-to" / "own-jax-learner.md"
+ROOTS = [README, AGENTS, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
+ALL = [*ROOTS, *sorted(DOCS.glob("**/*.md"))]
+WHOLE = (ROBOT, OBJECTS, COMPARE, LEARNER)  # that have tests of their own
+PAGES = [page for page in ALL if "```python" in page.read_text() and page not in WHOLE]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 PROGRAMS = ("csac-jax", "make", "pip", "python", "jupyter", "source", "srun")
@@ -255,6 +261,48 @@ def test_grippers_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 @pytest.mark.mjx
+@pytest.mark.optax
+def test_compare_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the blocks and the command of the page on own parts run in their order, with a small
+    preset, two seeds and two episodes; the report has one figure with the part and CSAC-beta."""
+    monkeypatch.chdir(tmp_path)
+    small = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setattr(presets, "quick", lambda: small)
+    assert _run_page(NUMBERS.sub(r"\1=2", COMPARE.read_text())) == 4
+    page = Path("page/index.html").read_text()
+    (svg,) = re.findall(
+        r'Training of smoke: variants.*?src="data:image/svg\+xml;base64,([^"]+)', page, re.DOTALL
+    )
+    drawn = base64.b64decode(svg).decode()
+    assert "CSAC-beta (2)" in drawn
+    assert "RankExponential(share=0.2)" in drawn
+    difference = re.search("Differences in training.*?</table>", page, re.DOTALL)
+    assert difference is not None
+    assert "RankExponential" in difference[0]
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+@pytest.mark.optax
+def test_learner_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: PPO of the page has at most 75 lines, and trains two seeds in one program, which
+    differ; blocks per action are shares."""
+    monkeypatch.chdir(tmp_path)
+    small = presets.smoke().change(sim={"physics": "c"})
+    monkeypatch.setattr(presets, "quick", lambda: small)
+    learner, run = fenced(LEARNER, "python")
+    assert len(learner.splitlines()) <= 75
+    namespace: dict[str, Any] = {"__name__": "page"}
+    exec(compile(learner, "page", "exec"), namespace)
+    with jax.debug_key_reuse(False):
+        exec(compile(run.replace("20, 2", "2, 2"), "page", "exec"), namespace)
+    curves = namespace["curves"]
+    assert curves.shape == (2, 2)
+    assert 0.0 <= curves.min() <= curves.max() <= 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
 def test_objects_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/objects.md run in their order, given a folder
     of meshes in millimetres."""
@@ -286,11 +334,66 @@ def test_pages_and_sentences_are_short(page: Path):
     assert len(page.read_text().split()) <= WORDS.get(page.name, 5000)
 
 
+def _named(page: Path) -> set[str]:
+    return set(re.findall(r"`([\w./]+/[\w./]+)`", page.read_text()))
+
+
+def test_pages_for_assistants_are_short_and_lead_somewhere():
+    """Claim: AGENTS.md has at most 60 lines; the paths that it and llms.txt name are there."""
+    assert len(AGENTS.read_text().splitlines()) <= 60
+    index = (ROOT / "llms.txt").read_text()
+    linked = re.findall(r"\]\(([^)]+)\)", index)
+    assert len(linked) > 15
+    assert not [path for path in [*linked, *_named(AGENTS)] if not (ROOT / path).exists()]
+    assert index.startswith("# csac_jax\n\n> ")
+
+
 def test_contributing_names_files_that_exist():
-    """Claim: the files that CONTRIBUTING tells to change are there."""
-    named = set(re.findall(r"`([\w./]+/[\w./]+)`", (ROOT / "CONTRIBUTING.md").read_text()))
-    assert len(named) > 15
+    """Claim: the files that CONTRIBUTING and its page tell to change are there."""
+    named = _named(ROOT / "CONTRIBUTING.md") | _named(EXTEND)
+    assert len(named) > 40
     assert not [path for path in named if "NAME" not in path and not (ROOT / path).exists()]
+
+
+def test_every_module_that_tells_primitives_apart_is_named():
+    """Claim: the page on a new primitive names every module that compares pushes and grasps."""
+    sources = (ROOT / "csac_jax").rglob("*.py")
+    compare = re.compile(r"Primitive\.(PUSH|GRASP)")
+    found = [path for path in sources if compare.search(path.read_text())]
+    text = EXTEND.read_text()
+    assert len(found) > 15
+    names = {path.relative_to(ROOT).as_posix() for path in found}
+    names -= {f"csac_jax/baselines/{name}.py" for name in ("antipodal", "oracle")}  # in one row
+    assert not [name for name in names if name not in text]
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("shipped", "fast/shipped/seed-0/eval-random10-c.json"),
+        ("shipped_camera", "fast/camera/seed-0/eval-camera.json"),
+        ("shipped_clutter", "fast/clutter/seed-1/eval-random30-high.json"),
+        ("shipped_grippers", "grippers/from_shipped_gpu/seed-0/eval-2f85.json"),
+        ("shipped_objects", "objects/gpu_cones/seed-7/eval-pile.json"),
+        ("shipped_target", "objects/gpu_target/seed-0/eval-target_objects.json"),
+    ],
+)
+def test_listed_policies_have_the_recorded_numbers(
+    name: str, path: str, capsys: pytest.CaptureFixture
+):
+    """Claim: `csac-jax policies` has each policy's task, hand, view and recorded result."""
+    measured = json.loads(record(path))
+    assert cli.main(["policies"]) == 0
+    head, result = capsys.readouterr().out.split(f"{name} ", 1)[1].splitlines()[:2]
+    part = measured.get("parts", {}).get("noise", measured)
+    shares = [f"{100 * part[one]['value']:.1f} %" for one in ("grasp_success", "completion")]
+    assert re.findall(r"[\d.]+ %", result) == shares
+    assert result.split(":")[0].split(",")[0].strip() == measured["suite"]
+    cfg = configs.from_dict(measured["config"])
+    assert ("marked" in head) == (cfg.task.kind == "target")
+    assert ("objects" in head) == cfg.scene.has_objects
+    assert ("oblique" in head) == (cfg.heightmap.view == "oblique")
+    assert f"hand {'any' if cfg.net.gripper else 'rg2'};" in head
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from csac_jax.cli import (
     output,
     parsing,
     play,
+    policies,
     report,
     scenes,
     serve,
@@ -36,6 +37,7 @@ from csac_jax.cli.failures import complain
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import files
+from csac_jax.runtime import modules
 from csac_jax.section import require
 
 _LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or raise --devices"
@@ -45,6 +47,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "sweep": sweep.run,
     "eval": evaluate.run,
     "play": play.run,
+    "policies": policies.run,
     "calibrate": calibrate.run,
     "act": act.run,
     "serve": serve.run,
@@ -66,6 +69,7 @@ A robot learns to push and grasp in clutter.
   sweep PRESET       train several seeds and settings side by side, in one program
                      --seeds N, --vary NAME=A,B
   eval POLICY        measure a policy: a run's folder, a policy file, or one that is shipped
+  policies           list the policies that are shipped, and what each is for
   play               run one episode, as text, picture and video
   calibrate          find the camera's pose by a printed board
   act POLICY         decide where to grasp or push in a camera's image
@@ -80,6 +84,8 @@ A robot learns to push and grasp in clutter.
   bench NAME         speed of a part, as JSON; needs a checkout of the sources
 
 `--device cpu` or `--device gpu` says where JAX computes.
+`--import MODULE` first loads a module of your own, for the presets, algorithms, suites and policies
+that it registers.
 `{PROGRAM} COMMAND --help` lists the options of a command; --version prints the version.
 """
 
@@ -144,7 +150,7 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     require(name in COMMANDS, algorithms.unknown("command", name, COMMANDS))
     try:
-        return COMMANDS[name](_on_device(rest))
+        return COMMANDS[name](_on_device(_with_modules(rest)))
     except (RuntimeError, AssertionError) as error:
         from csac_jax.runtime import devices
 
@@ -153,6 +159,15 @@ def _dispatch(arguments: list[str]) -> int:
             raise
         text = f"the device is out of memory; {_LESS} ({files.first_line(error)})"
         raise FailedError(text) from None
+
+
+def _with_modules(arguments: list[str]) -> list[str]:
+    """Loads the modules of one's own that `--import` names; returns the other arguments."""
+    given, rest = parsing.take_all(arguments, "--import")
+    for module in given:
+        require(module is not None, "--import: give the name of a module")
+        modules.load(str(module))
+    return rest
 
 
 def _on_device(arguments: list[str]) -> list[str]:

@@ -23,7 +23,8 @@ class ActOptions(RobotOptions):
     pose: Path
     """JSON with the 4 x 4 matrix from camera (x right, y down, z forward) to workspace, m."""
     mask: Path | None = None
-    """Image or .npy that is not 0 at the object to get."""
+    """Image or .npy that is not 0 at the object to get. A policy that was not trained with targets
+    then only grasps, and only that object."""
     top: int = 1
     """Number of actions, best first."""
     check: bool = False

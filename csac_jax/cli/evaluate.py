@@ -16,10 +16,11 @@ from csac_jax.cli import output, settings
 from csac_jax.cli.failures import check_seed
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
-from csac_jax.runtime import processes, signals
+from csac_jax.runtime import modules, processes, signals
 from csac_jax.section import require
 
 EPISODES = 50  # of every part of a suite, where neither --episodes nor --out is given
+WORST = 12  # objects that are printed; the result has all
 TABLE = "table.md"  # in the folder --out
 
 
@@ -34,7 +35,8 @@ class EvalOptions:
     policy: str = "learned"
     """Actor: learned, the networks; random, above blocks; geometric, antipodal grasps from the
     height map; oracle, which reads the blocks' poses; planner, which simulates many actions;
-    learned+planner, which simulates those of the networks; or MODULE:NAME, your own."""
+    learned+planner, which simulates those of the networks; or MODULE:NAME, your own, or the name
+    that a module of --import registers."""
     suites: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--suite"])] = ("in_distribution",)
     """Scenes: in_distribution (like the training's), random10, random30, cases, packed, camera
     (ever worse ones), blocked, tray; target, enclosed, hidden (of that task); pile, tight,
@@ -134,8 +136,12 @@ def _measure(
     changes: dict[str, Any],
     suite: str,
     episodes: int,
+    own_modules: tuple[str, ...] = (),
 ) -> dict[str, Any]:
-    """Measures the policy in a suite; returns the metrics with all that they follow from."""
+    """Measures the policy in a suite; returns the metrics with all that they follow from. Loads
+    `own_modules`, which a process of its own lacks."""
+    for module in own_modules:
+        modules.load(module)
     from csac_jax.evaluation import policies, rollout, suites
     from csac_jax.io import configs
     from csac_jax.runtime import cache, provenance
@@ -184,7 +190,8 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
         _write_table(out, paths)
         print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
 
-    tasks = [(options, changes, suite, numbers[suite]) for suite in waiting]
+    own = modules.names()
+    tasks = [(options, changes, suite, numbers[suite], own) for suite in waiting]
     with output.progress() as bars:
         jobs = options.jobs or processes.cores()
         processes.each(_measure, tasks, jobs, _shown(bars), on_done)
@@ -253,6 +260,19 @@ def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
     return show
 
 
+def _print_objects(objects: dict[str, Any]) -> None:
+    """Prints the WORST objects, by the share of their episodes at whose end they were gone."""
+    from rich.console import Console
+    from rich.table import Table
+
+    shares = sorted(objects.items(), key=lambda item: item[1]["gone"] / item[1]["episodes"])
+    title = f"objects that stayed most often, of {len(objects)}"
+    table = Table("object", "gone", "episodes", title=title)
+    for name, entry in shares[:WORST]:
+        table.add_row(name, str(entry["gone"]), str(entry["episodes"]))
+    Console(highlight=False).print(table)
+
+
 def print_summary(title: str, summary: dict[str, Any]) -> None:
     """Prints every metric, and a dash for one without cases."""
     from rich.console import Console
@@ -269,5 +289,7 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
             table.add_row(name, result_tables.shown(metric=name, band=band), str(entry["n"]))
     console = Console(highlight=False)
     console.print(table)
+    if "objects" in summary:
+        _print_objects(summary["objects"])
     for name in ("outcomes", "counts"):
         console.print(f"{name}:", ", ".join(f"{key} {n}" for key, n in summary[name].items()))

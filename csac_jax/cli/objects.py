@@ -167,13 +167,14 @@ def _row(member: Any) -> dict[str, Any]:
 
 def _list(objects: Any) -> None:
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
 
     from csac_jax import grippers
     from csac_jax.config import SimConfig
 
     rows = [_row(member) for member in objects]
-    table = Table("object", "size, mm", "narrowest, mm", "mass, g", "parts", "split")
+    name = Column("object", overflow="fold")  # whole names, on narrow terminals too
+    table = Table(name, "size, mm", "narrowest, mm", "mass, g", "parts", "split")
     for name, sides, narrowest, mass, *rest in map(dict.values, rows):
         size = " x ".join(f"{side:.0f}" for side in sides)
         table.add_row(name, size, f"{narrowest:.0f}", f"{mass:.0f}", *map(str, rest))

@@ -103,7 +103,13 @@ def asks_help(arguments: Sequence[str]) -> bool:
 
 def take(arguments: Sequence[str], option: str) -> tuple[str | None, list[str]]:
     """Returns the last value of an option that decides how the others are read, and the others."""
+    values, rest = take_all(arguments, option)
+    return values[-1] if values else None, rest
+
+
+def take_all(arguments: Sequence[str], option: str) -> tuple[list[str | None], list[str]]:
+    """Returns the values of an option that decides how the others are read, and the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument(option, dest="value", nargs="?")
+    parser.add_argument(option, dest="values", nargs="?", action="append", default=[])
     parsed, rest = parser.parse_known_args(arguments)
-    return parsed.value, rest
+    return parsed.values, rest

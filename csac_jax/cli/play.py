@@ -26,8 +26,8 @@ class PlayOptions:
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
-    """Policy: oracle (reads the blocks' poses), planner (simulates many actions), random, a shipped
-    one, a run or a policy file."""
+    """Policy: oracle (reads the poses), planner (simulates many actions), geometric, random, one
+    that a module of --import registers, a shipped one, a run or a policy file."""
     physics: Literal["c", "mjx"] = "c"
     """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
@@ -101,7 +101,7 @@ def _policy(source: str) -> Any:
     """Returns the policy; one without networks has the config of `quick`."""
     from csac_jax.evaluation import policies
 
-    if source in ("oracle", "planner", "random"):
+    if source in policies.BASELINES:
         return policies.BASELINES[source](presets.quick())
     return policies.load(source)
 
@@ -111,7 +111,8 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
     `view` holds changes of the policy's config.
     """
-    from csac_jax.evaluation import rollout, suites
+    from csac_jax.evaluation import policies, rollout, suites
+    from csac_jax.io import made_for
     from csac_jax.render import episode
     from csac_jax.runtime import cache
 
@@ -122,8 +123,10 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     (env,) = prepared.parts.values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
+    if policies.is_learned(policy):
+        made_for.warn_if_elsewhere(policy.cfg, env.cfg)
     steps: list[Any] = []
-    for step in rollout.episode(env, policy.replace(cfg=env.cfg), options.seed):
+    for step in rollout.episode(env, policies.in_world(policy, env.cfg), options.seed):
         steps.append(step)
         print(episode.line(len(steps), step), flush=True)
     return env, steps

@@ -10,6 +10,7 @@ from csac_jax.cli.failures import check_extra
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import files
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,7 +20,8 @@ class ReportOptions:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of runs, archives of them (.tar.xz), folders of these, and files of `eval --json`."""
     out: Path | None = None
-    """Folder to write a page to, with curves, pictures and videos; needs the extra `report`."""
+    """Page to write, a name in .html, with curves, pictures and videos, or a folder for the page
+    and its tables as Markdown; needs the extra `report`."""
     markdown: Path | None = None
     """File to write the tables to, as a page of documentation."""
     json: Path | None = None
@@ -35,6 +37,9 @@ def run(arguments: list[str]) -> int:
         raise SettingsError("report: give at least one folder of a run or file of `eval --json`")
     if options.out is not None:
         check_extra("--out", "jinja2", "report")
+        is_page, exists = options.out.suffix == ".html", options.out.exists()
+        fits = not exists or options.out.is_dir() != is_page
+        require(fits, f"--out: {options.out} is a {'folder' if is_page else 'file'}; name another")
     from csac_jax.report import comparison, result_tables, results
 
     recorded = results.read(options.runs)

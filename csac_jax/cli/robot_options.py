@@ -29,11 +29,15 @@ class RobotOptions(PolicyOptions):
     """Folder of one robot that stores images, decisions and outcomes, for finetune."""
 
     def load(self) -> Any:
-        """Loads the policy."""
+        """Loads the policy; warns of one that was not trained on images of a camera."""
         from csac_jax.deploy import CameraPolicy, image_files
+        from csac_jax.io import made_for
 
         workspace = None if self.workspace is None else image_files.read_pose(self.workspace)
-        return CameraPolicy.load(self.policy, workspace, self.gripper)
+        policy = CameraPolicy.load(self.policy, workspace, self.gripper)
+        camera = {"heightmap": {"view": "oblique"}, "sensor": {"kind": "d415"}}
+        made_for.warn_if_elsewhere(policy.cfg, policy.cfg.change(**camera))
+        return policy
 
     def recorder(self) -> Any:
         """Opens the record, if there is one."""

@@ -118,7 +118,11 @@ def _description(options: type, command: str, examples: Sequence[str]) -> str:
         *(inspect.getdoc(options) or "", "", f"presets: {PRESETS}", ""),
         *(f"algorithms: {', '.join(algorithms.ALGORITHMS)}", "", "examples:"),
         *(f"  {PROGRAM} {command.split()[0]} {example}" for example in examples),
-        *("", f"`--device cpu|gpu` says where JAX computes. All settings: {PROGRAM} {command}"),
+        *(
+            "",
+            "`--device cpu|gpu` says where JAX computes. `--import MODULE` first loads a module of",
+        ),
+        f"your own. All settings: {PROGRAM} {command}",
         "--help-all; below are those that people change first.",
     ]
     return "\n".join(lines)

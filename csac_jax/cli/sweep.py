@@ -1,14 +1,13 @@
 """`csac-jax sweep`: several seeds and settings side by side."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
 from csac_jax import presets
-from csac_jax.cli import failures, output, settings
+from csac_jax.cli import failures, settings
 from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
@@ -70,7 +69,7 @@ def run(arguments: list[str]) -> int:
     """Trains all; returns the exit code."""
     stop = signals.install()
     options, plan = read(arguments)
-    begun, resume = time.time(), options.resume is not None
+    resume = options.resume is not None
     from csac_jax import api
     from csac_jax.runtime import cluster
 
@@ -82,13 +81,15 @@ def run(arguments: list[str]) -> int:
     except FileExistsError:  # another process made it meanwhile
         raise failures.exists(folder) from None
     if cluster.is_first():
-        _report(options, folder, result, round(time.time() - begun, 1))
+        _report(result)
+        if options.json is not None:
+            files.write_json(options.json, files.read_object(folder / files.RECORD))
         if plan.episodes and result.stopped_by is None:
             _write_study(folder)
     return 0 if result.stopped_by is None else 128 + result.stopped_by
 
 
-def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) -> None:
+def _report(result: Any) -> None:
     from csac_jax.evaluation.statistics import Band
     from csac_jax.report import result_tables
 
@@ -96,10 +97,6 @@ def _report(options: SweepOptions, folder: Path, result: Any, seconds: float) ->
         band = Band(**point["grasp_success"])
         success = result_tables.shown(metric="grasp_success", band=band) if band.n else "unknown"
         print(f"{point['name']}: grasp success {success}, interquartile mean of {band.n} seeds")
-    times = {"compile_seconds": result.compile_seconds, "wall_seconds": seconds}
-    written = {"run_dir": str(folder), **result.summary, **times, "stopped_by": result.stopped_by}
-    for path in (folder / "train.json", options.json):  # `report` reads the first
-        output.write_result(path, written)
 
 
 def _write_study(folder: Path) -> None:

@@ -1,14 +1,14 @@
 """`csac-jax train`: one run, new or resumed."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import Literal
 
-from csac_jax.cli import failures, output, parsing, settings
+from csac_jax.cli import failures, parsing, settings
 from csac_jax.config import Config
 from csac_jax.constants import EVAL_EPISODES, EVAL_SUITE
 from csac_jax.errors import SettingsError
+from csac_jax.io import files
 from csac_jax.runtime import signals
 
 EXAMPLES = (
@@ -57,14 +57,14 @@ def run(arguments: list[str]) -> int:
     """Trains; returns the exit code."""
     stop = signals.install()
     options, cfg = read(arguments)
-    begun, resume = time.time(), options.resume is not None
+    resume = options.resume is not None
     from csac_jax import api
 
     folder = options.resume or options.run_dir or api.new_folder(f"{cfg.preset}-{cfg.seed}")
     from csac_jax.training.trackers import TRACKERS
 
     try:
-        done = api.train(
+        api.train(
             cfg,
             folder,
             resume=resume,
@@ -78,10 +78,8 @@ def run(arguments: list[str]) -> int:
         )
     except FileExistsError:  # another process made it meanwhile
         raise failures.exists(folder) from None
-    seconds = round(time.time() - begun, 1)
-    result = {"run_dir": str(folder), **done.summary._asdict(), "wall_seconds": seconds}
-    for path in (folder / "train.json", options.json):  # `report` reads the first
-        output.write_result(path, result, done.cfg)
+    if options.json is not None:
+        files.write_json(options.json, files.read_object(folder / files.RECORD))
     return stop.exit_code
 
 

@@ -24,8 +24,8 @@ from csac_jax.deploy.checks import CameraReport
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.images import CameraView
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.io import policy_file
-from csac_jax.runtime import cache
+from csac_jax.io import made_for, policy_file
+from csac_jax.runtime import cache, short
 from csac_jax.section import require
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import depth_camera
@@ -55,6 +55,8 @@ class CameraPolicy:
     params: Params
     workspace_pose: np.ndarray = dataclasses.field(default_factory=lambda: np.eye(4))  # to robot
 
+    __repr__ = short.text
+
     @classmethod
     def load(
         cls, source: str | Path = "shipped", workspace_pose: Any = None, gripper: str | None = None
@@ -62,15 +64,17 @@ class CameraPolicy:
         """Loads a shipped policy, a policy file, or a run's folder, which needs MuJoCo.
 
         Args: workspace_pose, 4 x 4, workspace to robot frame; the identity by default. gripper, the
-        robot's, by name or folder; by default that of the training. A policy for any gripper must
-        know it before it decides.
+        robot's, by name or folder; by default that of the training, and another one is a warning.
+        A policy for any gripper must know it before it decides.
         Raises FileNotFoundError, PolicyFileError, CheckpointError or SettingsError.
         """
         path = policy_file.find(source)
         pose = np.eye(4) if workspace_pose is None else images.rigid(workspace_pose, "workspace")
         cfg, params = policy_file.load(path) if path.is_file() else _load_run(path)
         chosen = grippers.resolve(cfg.sim.gripper if gripper is None else gripper)
-        return cls(cfg.change(sim={"gripper": chosen}), jax.device_put(params), pose)
+        here = cfg.change(sim={"gripper": chosen})
+        made_for.warn_if_elsewhere(cfg, here)
+        return cls(here, jax.device_put(params), pose)
 
     def decide(
         self,
@@ -86,7 +90,8 @@ class CameraPolicy:
         Args: rgb [h, w, 3] uint8; depth [h, w] float, m along the optical axis, 0 or NaN where
         it is missing; intrinsics, an `Intrinsics` or a dict of its fields, for both images;
         camera_pose 4 x 4, camera (x right, y down, z forward) to workspace; target_mask [h, w]
-        bool, the object to get. Raises SettingsError for arrays of a wrong form, ViewError for an
+        bool, the object to get: a policy that was not trained with targets then only grasps, and
+        only that object. Raises SettingsError for arrays of a wrong form, ViewError for an
         image that does not fit the pose. Warns (DataWarning) if colours seem to be BGR.
         """
         check_top(top)

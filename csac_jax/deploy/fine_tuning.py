@@ -7,6 +7,7 @@ n = transitions.
 import dataclasses
 import functools
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +25,7 @@ from csac_jax.config import Config, UniformReplay
 from csac_jax.constants import CHANGE_AREA, OUTCOMES, Outcome, Primitive
 from csac_jax.deploy import CameraPolicy, record
 from csac_jax.deploy.record import PUSHED, Entry
-from csac_jax.errors import FailedError, SettingsError
+from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.replay import ring, samplers
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import cache, compiler
@@ -35,6 +36,7 @@ from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import PackedObservation
 
 UPDATES = 10  # of the critic in a step, after which the actor has one (ours)
+FEW = 100  # actions of a record (ours); docs/robot.md has what some hundred brought
 _AT_ONCE = 32  # transitions that are rewarded together: their maps fill the memory
 
 Progress = Callable[[int, int, float, float], None]
@@ -91,11 +93,14 @@ def run(
     """Returns the policy after learning from the record in `folder`, or until `stop`.
 
     Its config stays. Raises SettingsError for a record that nothing can be learned from,
-    FailedError if a loss is not finite.
+    FailedError if a loss is not finite. Warns of a record with fewer actions than FEW.
     """
     cache.enable()
     stop = stop or Stop()
     recorded = load(policy, record.read(folder))
+    if (few := len(recorded.outcome)) < FEW:
+        text = f"{folder} has {few} actions; a policy that learns from so few may get worse"
+        warnings.warn(f"{text}: record {FEW} or more", DataWarning, stacklevel=2)
     program = make_program(configure(policy.cfg, settings, len(recorded.outcome)))
     key, learner = jax.random.key(settings.seed), init(program, policy.params)
     rewarded = transitions(policy, program.learner, learner, recorded)

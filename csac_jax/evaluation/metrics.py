@@ -22,7 +22,8 @@ block.
 
 The first two efficiencies are no shares: a grasp that lifts two blocks takes both, so they can
 exceed 1. `failures` are shares too, see `_failures`. `outcomes` counts grasps by outcome. `counts`
-holds episodes, blocks, pushes, grasps, and blocks taken and lost.
+holds episodes, blocks, pushes, grasps, and blocks taken and lost. Of suites of objects `objects`
+counts by object, see `by_object`.
 """
 
 import statistics
@@ -54,6 +55,7 @@ class Episodes(NamedTuple):
     blocks: Any = None  # [M] int32, in play at the start; these three come at the end
     completed: Any = None  # [M] bool, no block was in the workspace at the end
     ending: Any = None  # [M] int32, index into ENDINGS
+    left: Any = None  # [M, N] bool, blocks by their slots, in play at the end
 
 
 def wilson(successes: int, n: int) -> dict[str, Any]:
@@ -82,7 +84,8 @@ def _wilson(share: float, n: int, worth: float) -> dict[str, Any]:
     shrink = 1.0 + _Z**2 / worth
     middle = (share + 0.5 * _Z**2 / worth) / shrink
     half = _Z * np.sqrt(share * (1.0 - share) / worth + (0.5 * _Z / worth) ** 2) / shrink
-    low, high = min(share, middle - half), max(share, middle + half)  # rounding, at 0 and 1
+    # Rounding would leave 0 .. 1, or the value outside.
+    low, high = max(0.0, min(share, middle - half)), min(1.0, max(share, middle + half))
     return {"value": share, "low": float(low), "high": float(high), "n": n}
 
 
@@ -129,6 +132,19 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
             "blocks_lost": int(episodes.blocks_lost.sum()),
         },
     }
+
+
+def by_object(names: np.ndarray, in_play: np.ndarray, left: np.ndarray) -> dict[str, Any]:
+    """Counts, for each object, the episodes that had it and those in which it was gone at the end.
+
+    Args: all [M, N] by slots: names, and whether it was in play at the start and at the end.
+    """
+    counts: dict[str, Any] = {}
+    for name, stays in zip(names[in_play].tolist(), left[in_play].tolist(), strict=True):
+        entry = counts.setdefault(name, {"episodes": 0, "gone": 0})
+        entry["episodes"] += 1
+        entry["gone"] += not stays
+    return dict(sorted(counts.items()))
 
 
 def _mean(values: np.ndarray) -> dict[str, Any]:

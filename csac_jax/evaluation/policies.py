@@ -1,8 +1,6 @@
 """Policies: objects that take one scene and a key, and return an action."""
 
 import dataclasses
-import importlib
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
@@ -22,7 +20,9 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
-from csac_jax.training import programs
+from csac_jax.runtime import modules, short
+from csac_jax.section import require
+from csac_jax.training import own_parts, programs
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
@@ -49,6 +49,9 @@ class PolicyDebug(NamedTuple):
     candidates: jax.Array  # [P, J, 3] m, m, rad: the poses of the last CEM round
     best_grasp: jax.Array  # [] phi_g of CSAC eq. 16, by the critic that acts
 
+    def __repr__(self) -> str:
+        return short.text(self)
+
 
 @struct.dataclass
 class NetworkPolicy:
@@ -58,6 +61,8 @@ class NetworkPolicy:
     cfg: Config = struct.field(pytree_node=False)
     params: actor_critic.Params
     network: Any = struct.field(pytree_node=False, default=None)  # a custom critic
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -102,6 +107,8 @@ class CustomLearnerPolicy:
     learner: Learner = struct.field(pytree_node=False)
     state: Any
 
+    __repr__ = short.text
+
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
         obs, unchanged, _ = _alone(_seen(scene))
@@ -113,6 +120,8 @@ class RandomPolicy:
     """Random grasps, above a block unless `policy.action_mask` is `none`."""
 
     cfg: Config = struct.field(pytree_node=False)
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -127,6 +136,8 @@ class OraclePolicy:
 
     cfg: Config = struct.field(pytree_node=False)
 
+    __repr__ = short.text
+
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
         """Chooses a grasp. Raises TypeError for an observation."""
@@ -140,10 +151,12 @@ class OraclePolicy:
 
 @struct.dataclass
 class GeometricPolicy:
-    """Antipodal grasps from the height map's edges, without networks; see `agent.antipodal`."""
+    """Antipodal grasps from the height map's edges, without networks; see `baselines.antipodal`."""
 
     cfg: Config = struct.field(pytree_node=False)
     weights: antipodal.Weights = antipodal.Weights()
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -165,6 +178,8 @@ class PlannerPolicy:
     cfg: Config = struct.field(pytree_node=False)
     proposer: NetworkPolicy | None = None
     budget: planner.Budget = planner.Budget()
+
+    __repr__ = short.text
 
     @jax.jit
     def __call__(self, scene: Observation | State, key: jax.Array) -> Action:
@@ -242,6 +257,7 @@ def load(
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
+    own_parts.check_loadable(folder, cfg, own_parts.Parts(network=network, learner=learner))
     state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)
@@ -284,11 +300,19 @@ def _imported(path: str) -> Callable[[Config], Policy]:
     """Imports `MODULE:NAME`, also from the current folder."""
     module, _, name = path.partition(":")
     try:
-        if (here := str(Path.cwd())) not in sys.path:
-            sys.path.insert(0, here)
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
+        return getattr(modules.load(module), name)
+    except (SettingsError, AttributeError) as error:
         raise SettingsError(f"policy: '{path}' cannot be imported ({error})") from None
+
+
+def register(name: str, build: Callable[[Config], Policy]) -> None:
+    """Registers a policy, made from the config that it acts in, for `eval` and `play`.
+
+    Raises SettingsError if the name is taken.
+    """
+    taken = name in BASELINES or name in LEARNED
+    require(not taken, f"policy '{name}' exists; choose another name")
+    BASELINES[name] = build
 
 
 LEARNED = ("learned", "learned+planner")

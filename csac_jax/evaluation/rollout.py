@@ -16,12 +16,13 @@ from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import NetworkPolicy, Policy, PolicyDebug
+from csac_jax.io import made_for
 from csac_jax.objects.library import Split
 from csac_jax.robot import primitives
 from csac_jax.runtime import compiler
 from csac_jax.sim import physics as simulation
 from csac_jax.training import transitions
-from csac_jax.world import object_slots, scene_state
+from csac_jax.world import blocks, object_slots, scene_state
 
 SIDE_BY_SIDE = 64  # most episodes that run at once
 PER_CORE = 4  # of them on a CPU: more gain nothing, and the last episodes keep all places busy
@@ -53,12 +54,30 @@ def evaluate(
         )
     tables = {}
     for name, env in suite.parts.items():
+        if policies.is_learned(policy):
+            made_for.warn_if_elsewhere(policy.cfg, env.cfg)
         actor = policies.in_world(policy, env.cfg)
         count = functools.partial(on_progress, name) if on_progress else None
-        tables[name] = metrics.summarise(rollout(env, actor, suite.episodes, suite.seed, count))
+        ended = rollout(env, actor, suite.episodes, suite.seed, count)
+        tables[name] = metrics.summarise(ended)
         if env.cfg.scene.has_objects:
+            tables[name]["objects"] = _by_object(env, ended)
             tables[name]["scenes_sha256"] = object_slots.fingerprint(env.cfg.scene, env.scenes)
     return next(iter(tables.values())) if len(tables) == 1 else {"parts": tables}
+
+
+def _by_object(env: Env, episodes: Episodes) -> dict[str, Any]:
+    """Counts by object, see `metrics.by_object`; blocks among the objects are of one name."""
+    rows = _rows(env, len(episodes.completed))
+    library = np.array([one.name for one in object_slots.library(env.cfg.scene).objects])
+    names = library[np.asarray(env.scenes.numbers)[rows]]
+    names = np.where(blocks.is_object(env.cfg.scene.slots), names, "block")
+    return metrics.by_object(names, np.asarray(env.scenes.in_play)[rows], episodes.left)
+
+
+def _rows(env: Env, episodes: int) -> np.ndarray:
+    """Returns each episode's scene, spread evenly over the pool."""
+    return np.arange(episodes) * env.scenes.position.shape[0] // episodes
 
 
 def rollout(
@@ -79,8 +98,9 @@ def rollout(
     static: Any = (type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
     begin, step = _compiled(*static)
     key = jax.random.key(seed)
-    rows = np.arange(episodes) * env.scenes.position.shape[0] // episodes
-    blocks = np.asarray(env.scenes.in_play.sum(axis=1))[rows]
+    rows = _rows(env, episodes)
+    started = np.asarray(env.scenes.in_play)[rows]
+    number, left = started.sum(axis=1), np.zeros_like(started)
 
     def begun(numbers: np.ndarray) -> State:
         scenes = jax.tree.map(lambda leaf: leaf[rows[numbers]], env.scenes)
@@ -99,10 +119,12 @@ def rollout(
                 here = np.pad(some, (0, few - some.size), constant_values=places)
                 states = _put(states, here, begun(np.resize(chosen, few)))
         states, record = step(type(policy), _pytree(policy), key, np.maximum(numbers, 0), states)
-        record, done, terminated = jax.device_get((record, states.done, states.terminated))
+        at_end = states.done, states.terminated, states.scene.in_play
+        record, (done, terminated, in_play) = jax.device_get((record, at_end))
         busy = numbers != _NONE
         over = numbers[busy & done]
         completed[over], ending[over] = terminated[busy & done], endings(env, states)[busy & done]
+        left[over] = in_play[busy & done]
         tables = tables or _blank(record, episodes, env.cfg.task.max_actions)
         for table, leaf in zip(jax.tree.leaves(tables), jax.tree.leaves(record), strict=True):
             table[numbers[busy], actions[busy]] = leaf[busy]
@@ -111,8 +133,9 @@ def rollout(
             on_progress(episodes - waiting.size - int(np.sum(numbers != _NONE)), episodes)
     assert tables is not None
     lost = tables.blocks_lost.sum(axis=1)
-    blocks = np.ones_like(blocks) if env.cfg.task.kind == "target" else blocks
-    return tables._replace(blocks_lost=lost, blocks=blocks, completed=completed, ending=ending)
+    number = np.ones_like(number) if env.cfg.task.kind == "target" else number
+    at_ends = {"completed": completed, "ending": ending, "left": left}
+    return tables._replace(blocks_lost=lost, blocks=number, **at_ends)
 
 
 _NONE = -1  # number of the episode in a place that is free

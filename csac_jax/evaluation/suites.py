@@ -53,6 +53,7 @@ from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import MAX_FAILURES, Env
 from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
+from csac_jax.runtime import short
 from csac_jax.scenes import arrange, cases, certify, constructions, pool
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
@@ -94,6 +95,9 @@ class PreparedSuite(NamedTuple):
     parts: dict[str, Env]
     episodes: int  # of every part
     seed: int
+
+    def __repr__(self) -> str:
+        return short.text(self)
 
 
 SUITES: dict[str, Suite] = {}

@@ -38,7 +38,10 @@ FORMAT = 2
 
 def to_dict(cfg: Config) -> dict[str, Any]:
     """Returns a config as plain JSON values, with the number of its format."""
-    return {"format": FORMAT, **json.loads(json.dumps(vars(cfg), default=_plain))}
+    values = {"format": FORMAT, **json.loads(json.dumps(vars(cfg), default=_plain))}
+    if not cfg.parts:
+        del values["parts"]  # earlier versions read such a config
+    return values
 
 
 def _plain(value: Section | Gripper) -> dict[str, Any]:

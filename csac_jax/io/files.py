@@ -22,6 +22,7 @@ from csac_jax.io import renames
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
+RECORD = "train.json"  # device, versions and commit: in the folder of a run, or of its sweep
 EVALUATIONS = "evaluations.jsonl"
 SWEEP_PLAN = "sweep.json"
 BEST = "best"

@@ -16,6 +16,7 @@ from csac_jax.render import media, panels, picture, viewer
 from csac_jax.render.picture import Viewpoint
 from csac_jax.sim import c_physics
 from csac_jax.world import blocks, model, scene_state
+from csac_jax.world.scene_state import SceneState
 
 VIEWS: dict[RobotKind, Viewpoint] = {
     "hand": Viewpoint(position=(-0.22, -0.5, 0.46), look_at=(0.0, -0.01, 0.05)),
@@ -101,10 +102,10 @@ def line(number: int, step: StepRecord) -> str:
         gone = scene.colour[scene.in_play & ~after.scene.in_play]
         text += f" ({', '.join(blocks.COLOUR_NAMES[colour] for colour in gone)})"
     if info.blocks_lost:
-        text += f", {_blocks(int(info.blocks_lost))} left the workspace"
+        text += f", {_counted(int(info.blocks_lost), scene)} left the workspace"
     if info.physics_diverged:
         text += ", physics diverged"
-    left = _blocks(int(after.scene.in_play.sum()))
+    left = _counted(int(after.scene.in_play.sum()), scene)
     return f"{number:3d} {text}; reward {float(step.reward):+.2f}; {left} left"
 
 
@@ -116,11 +117,12 @@ def summary(env: Env, steps: list[StepRecord]) -> str:
     elif last.scene.target != scene_state.ANY:
         ending = "the target is taken" if completed(steps) else "the target is lost"
     else:
-        ending = "the table is clear" if completed(steps) else "no block is left within reach"
+        none = f"no {_noun(last.scene)} is left within reach"
+        ending = "the table is clear" if completed(steps) else none
     actions = f"{len(steps)} action{'s' if len(steps) != 1 else ''}"
     taken, lost = totals(steps)
-    fate = f", {_blocks(lost)} left the workspace" if lost else ""
-    return f"{ending} after {actions}: {_blocks(taken)} taken{fate}"
+    fate = f", {_counted(lost, last.scene)} left the workspace" if lost else ""
+    return f"{ending} after {actions}: {_counted(taken, last.scene)} taken{fate}"
 
 
 def completed(steps: list[StepRecord]) -> bool:
@@ -136,8 +138,12 @@ def totals(steps: list[StepRecord]) -> tuple[int, int]:
     return sum(int(info.cleared) for info in infos), sum(int(info.blocks_lost) for info in infos)
 
 
-def _blocks(count: int) -> str:
-    return f"{count} block{'s' if count != 1 else ''}"
+def _noun(scene: SceneState) -> str:
+    return "block" if scene.object_id is None else "object"
+
+
+def _counted(count: int, scene: SceneState) -> str:
+    return f"{count} {_noun(scene)}{'s' if count != 1 else ''}"
 
 
 def record(

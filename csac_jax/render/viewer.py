@@ -4,7 +4,6 @@ The page needs the extra `viewer`. It listens on 127.0.0.1 only.
 """
 
 import contextlib
-import itertools
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,8 +19,9 @@ PORT = 8080  # of the page, or the next free one
 CLOSING = 10.0  # s that a window may take to close
 _PLANE = 1.0  # half side of an endless plane as drawn, m
 
-# Shows a pose and a line of text; returns False once the view is closed.
-Show = Callable[[mujoco.MjData, str], bool]
+# Shows a pose, a line of text and the picture's number; returns the number of the next picture, or
+# None once the view is closed.
+Show = Callable[[mujoco.MjData, str, int], int | None]
 
 
 def play(
@@ -31,17 +31,18 @@ def play(
     again: bool = True,
 ) -> None:
     """Shows actions, texts and qpos [T, ...], again and again until closed or by Ctrl-C."""
-    opened, data = _window(model) if gl.has_display() else _page(model, log), mujoco.MjData(model)
-    turns = itertools.count() if again else range(1)
+    frames = [(text, pose) for text, poses in actions for pose in poses]
+    opened = _window(model) if gl.has_display() else _page(model, len(frames), log)
+    data, number = mujoco.MjData(model), 0
     with contextlib.suppress(KeyboardInterrupt), opened as show:
-        for text, pose in (
-            (text, pose) for _ in turns for text, poses in actions for pose in poses
-        ):
-            data.qpos[:] = pose
+        while again or number < len(frames):
+            text, data.qpos[:] = frames[number % len(frames)]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_camlight(model, data)
-            if not show(data, text):
+            following = show(data, text, number % len(frames))
+            if following is None:
                 return
+            number = following
             time.sleep(1.0 / media.FRAMES_PER_SECOND)
 
 
@@ -51,12 +52,12 @@ def _window(model: mujoco.MjModel) -> Iterator[Show]:
 
     shown, others = mujoco.MjData(model), set(threading.enumerate())
 
-    def show(data: mujoco.MjData, _: str) -> bool:
+    def show(data: mujoco.MjData, _: str, number: int) -> int | None:
         with handle.lock():
             shown.qpos[:] = data.qpos
             mujoco.mj_forward(model, shown)
         handle.sync()
-        return bool(handle.is_running())
+        return number + 1 if handle.is_running() else None
 
     panels = {"show_left_ui": False, "show_right_ui": False}
     try:
@@ -70,16 +71,27 @@ def _window(model: mujoco.MjModel) -> Iterator[Show]:
 
 
 class Page:
-    """A scene of viser with the visible geoms of a model."""
+    """A scene of viser with the visible geoms of a model, and controls of `pictures` pictures."""
 
-    def __init__(self, server: Any, model: mujoco.MjModel) -> None:
+    def __init__(self, server: Any, model: mujoco.MjModel, pictures: int) -> None:
         server.scene.set_up_direction("+z")
 
         @server.on_client_connect
         def _(client: Any) -> None:
-            client.camera.position, client.camera.look_at = (-0.7, -0.7, 0.7), (0.0, 0.0, 0.05)
+            client.camera.position, client.camera.look_at = (-0.4, -0.4, 0.45), (0.0, 0.0, 0.03)
 
         self._text = server.gui.add_markdown("")
+        self.playing = server.gui.add_checkbox("play", True)
+        self.picture = server.gui.add_slider("picture", 0, max(pictures - 1, 1), 1, 0)
+        self.start = server.gui.add_button("from the start")
+        self._chosen: int | None = None
+        self.start.on_click(lambda _: self.choose(0))
+
+        @self.picture.on_update
+        def _(event: Any) -> None:
+            if event.client is not None:  # else it follows the motion
+                self.choose(self.picture.value)
+
         self.parts = {}
         for geom in np.flatnonzero(model.geom_rgba[:, 3] > 0.0):
             vertices, faces = mesh(model, int(geom))
@@ -88,25 +100,32 @@ class Page:
                 f"/geom{geom}", vertices, faces, color=(red, green, blue), flat_shading=True
             )
 
-    def show(self, data: mujoco.MjData, text: str) -> bool:
-        """Shows the model's pose; True, since a page never closes."""
+    def choose(self, number: int) -> None:
+        """Makes this picture the next one."""
+        self._chosen = number
+
+    def show(self, data: mujoco.MjData, text: str, number: int) -> int:
+        """Shows the model's pose; returns the next picture: the chosen, the following or, while it
+        does not play, the same."""
         if self._text.content != text:
             self._text.content = text
         for geom, part in self.parts.items():
             turn = np.empty(4)
             mujoco.mju_mat2Quat(turn, data.geom_xmat[geom])
             part.position, part.wxyz = data.geom_xpos[geom].copy(), turn
-        return True
+        self.picture.value = number
+        chosen, self._chosen = self._chosen, None
+        return number + self.playing.value if chosen is None else chosen
 
 
 @contextlib.contextmanager
-def _page(model: mujoco.MjModel, log: Callable[[str], None]) -> Iterator[Show]:
+def _page(model: mujoco.MjModel, pictures: int, log: Callable[[str], None]) -> Iterator[Show]:
     import viser
 
     server = viser.ViserServer(host="127.0.0.1", port=PORT, verbose=False)
     log(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends")
     try:
-        yield Page(server, model).show
+        yield Page(server, model, pictures).show
     finally:
         server.stop()
 

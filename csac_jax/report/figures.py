@@ -1,5 +1,6 @@
 """Figures of a report: training curves, suites, performance profiles."""
 
+import itertools
 import textwrap
 from collections.abc import Iterator, Sequence
 from io import BytesIO
@@ -17,12 +18,14 @@ from matplotlib.figure import Figure
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report.comparison import Curve, ResultReport, Score, grouped
-from csac_jax.report.variants import NAMES, Variant, label
+from csac_jax.report.variants import NAMES, OWN_LEARNER, Variant, label
 
 PALETTE = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7")
 """Colours that colour-blind readers can tell apart (Okabe and Ito 2008)."""
 COLOURS = dict(zip(NAMES, PALETTE, strict=False))
 GREY = "#7F7F7F"
+ALL = (*PALETTE, GREY, "#332288", "#117733", "#882255", "#999933", "#AA4499")
+"""Those, and more of Paul Tol's, for the methods of a figure that have no colour of their own."""
 MOST_LINES, MOST_SCORES = 6, 12  # of a panel; of a figure of a suite
 NAME_WIDTH, LEGEND_WIDTH = 36, 46  # characters of a line: right of a panel, below a figure
 LONGEST = 100  # characters of a name
@@ -55,6 +58,7 @@ def draw(report: ResultReport) -> Iterator[Chart]:
         plain = [curve for curve in curves if curve.variant.unchanged]
         varied = [curve for curve in curves if not curve.variant.unchanged]
         algorithms = {curve.variant.algo for curve in varied}
+        algorithms |= {report.reference} if OWN_LEARNER in algorithms else set()
         base = [curve for curve in plain if curve.variant.algo in algorithms]
         if plain:
             yield Chart(f"methods-{preset}", f"Training of {preset}: methods", training(plain))
@@ -83,11 +87,11 @@ def training(curves: Sequence[Curve]) -> Figure:
         len(groups), figsize=size, sharex=True, sharey=True, squeeze=False, layout="constrained"
     )
     for panel, group in zip(panels.flat, groups, strict=True):
-        algorithms = [curve.variant.algo for curve in group]
-        for index, curve in enumerate(group):
+        colours = _colours([curve.variant.algo for curve in group])
+        for curve, colour in zip(group, colours, strict=True):
             actions, bands = curve.points()
             name = textwrap.fill(f"{_short(curve.variant)} ({len(curve.runs)})", NAME_WIDTH)
-            _shaded(panel, actions, bands, color=_colour(algorithms, index), label=name)
+            _shaded(panel, actions, bands, color=colour, label=name)
         panel.legend(**LEGEND)
     panels[0, 0].set(xlim=(0, None), ylim=(None, 101))
     figure.supxlabel("actions", fontsize="medium")
@@ -103,13 +107,15 @@ def _shaded(panel: Axes, x: Any, bands: Sequence[Band | None], **style: Any) -> 
     panel.grid(alpha=0.3)
 
 
-def _colour(algorithms: Sequence[str], index: int) -> str:
-    """Returns an algorithm's colour for its first variant, else a colour that none of them has."""
-    algo = algorithms[index]
-    if algo in COLOURS and algo not in algorithms[:index]:
-        return COLOURS[algo]
-    spare = [colour for name, colour in COLOURS.items() if name not in algorithms]
-    return [*spare, GREY][index % (len(spare) + 1)]
+def _colours(algorithms: Sequence[str]) -> list[str]:
+    """Returns a colour for each variant: an algorithm's own for its first one, else one that no
+    other has, as long as there are any."""
+    spare = [colour for colour in ALL if colour not in map(COLOURS.get, algorithms)] or [GREY]
+    others = itertools.cycle(spare)
+    return [
+        COLOURS[algo] if algo in COLOURS and algo not in algorithms[:index] else next(others)
+        for index, algo in enumerate(algorithms)
+    ]
 
 
 def _short(variant: Variant) -> str:
@@ -172,7 +178,7 @@ def _style(scores: Sequence[Score], index: int) -> dict[str, Any]:
     for field in ("physics", "robot"):
         if len({getattr(other, field) for other in scores}) > 1:
             words.append(getattr(score, field))
-    colour = _colour([other.variant.algo for other in scores], index)
+    colour = _colours([other.variant.algo for other in scores])[index]
     name = f"{', '.join(words)} ({score.most_runs})"
     return {"label": textwrap.fill(name, LEGEND_WIDTH), "color": colour}
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import csac_jax
+from csac_jax.io import files
 from csac_jax.report import figures, result_tables, results
 from csac_jax.report.comparison import ResultReport
 
@@ -19,14 +20,16 @@ LARGEST = 8 * 2**20  # bytes of a picture or video that the page takes up
 MOST_MEDIA = 12
 
 
-def write(report: ResultReport, paths: Sequence[Path], folder: Path) -> list[Path]:
-    """Writes index.html, which needs no other file, and results.md. Pictures and videos that lie in
-    `paths`, as `play` writes them, are in the page."""
-    folder.mkdir(parents=True, exist_ok=True)
-    pages = {"index.html": render(report, paths), "results.md": result_tables.markdown(report)}
-    for name, text in pages.items():
-        (folder / name).write_text(text)
-    return [folder / name for name in pages]
+def write(report: ResultReport, paths: Sequence[Path], out: Path) -> list[Path]:
+    """Writes the page `out`, a name in .html, which needs no other file; or else a folder with
+    index.html and results.md. Pictures and videos that lie in `paths`, as `play` writes them, are
+    in the page."""
+    page = render(report, paths)
+    pages = {out / "index.html": page, out / "results.md": result_tables.markdown(report)}
+    pages = {out: page} if out.suffix == ".html" else pages
+    for path, text in pages.items():
+        files.replace(path, text)
+    return list(pages)
 
 
 def render(report: ResultReport, paths: Sequence[Path]) -> str:

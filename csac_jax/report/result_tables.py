@@ -226,11 +226,12 @@ def provenance(report: ResultReport) -> ResultTable:
     files = {run.path: (train_command(run.config), run.record) for run in report.results.runs}
     for one in report.results.evaluations:
         files[one.path] = one.command(trained.get(one.path.parent)), one.record
-    root = os.path.commonpath([path.parent for path in files]) if files else ""
+    folders = [path.parent.absolute() for path in files]  # one form: some are given relative
+    root = os.path.commonpath(folders) if files else ""
     return [
         {
-            "file": os.path.relpath(path, root),
-            "settings as a command": command,
+            "file": os.path.relpath(path.absolute(), root),
+            "settings as a command": command + _imports(record),
             "device": record.get("device") or "-",
             "versions": _versions(record) or "-",
             "commit": str(record.get("commit") or "-")[:10],
@@ -238,6 +239,10 @@ def provenance(report: ResultReport) -> ResultTable:
         }
         for path, (command, record) in files.items()
     ]
+
+
+def _imports(record: Json) -> str:
+    return "".join(f" --import {module}" for module in record.get("modules") or {})
 
 
 def _versions(record: Json) -> str:

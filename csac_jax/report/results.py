@@ -24,7 +24,6 @@ from csac_jax.report.variants import Json, Variant
 from csac_jax.section import require, shown
 
 ARCHIVE = ".tar.xz"  # of folders of runs
-RECORD = "train.json"  # device, versions and commit: in the folder of a run or above it
 SKIPPED = ("checkpoints", "tensorboard", "wandb", "best")
 METRICS = {
     "grasp_success": "grasp success",
@@ -46,6 +45,7 @@ _NUMBER: Any = int | float | None
 _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
 _RECORD = {"device": _TEXT, "versions": dict | None, "commit": _TEXT, "wall_seconds": _NUMBER}
+_RECORD["modules"] = dict | None
 _COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
 _METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "config": _CONFIG, "parts": {}}
@@ -76,7 +76,7 @@ class Evaluation(NamedTuple):
     part: str
     seed: int  # of the evaluation
     metrics: Json
-    record: Json  # wall_seconds, device, versions, commit; None where not recorded
+    record: Json  # wall_seconds, device, versions, commit, modules; None where not recorded
 
     def command(self, trained: Json | None = None) -> str:
         """Returns the command of this evaluation for a policy with the config `trained`."""
@@ -217,8 +217,8 @@ def _record(folder: Path, config: Json) -> Json:
     """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
     above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
-        record = _read_json(place / RECORD)
-        _check(record, _RECORD, RECORD)
+        record = _read_json(place / files.RECORD)
+        _check(record, _RECORD, files.RECORD)
         if record and renames.current(record.get("config", config)) == config:
             return record
     return {}
@@ -232,7 +232,7 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
     _check(content, _EVALUATION, "the file")
     suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
     parts = files.renamed(content.get("parts") or {Path(suite).stem: content})
-    record = {name: content.get(name) for name in ("device", "versions", "commit")}
+    record = {name: content.get(name) for name in ("device", "versions", "commit", "modules")}
     record["wall_seconds"] = content.get("seconds")
     _check(record, _RECORD, "the file")
     for part in parts.values():

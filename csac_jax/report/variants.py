@@ -21,6 +21,8 @@ NAMES = {
 }
 UNNAMED = {"seed", "preset", "algo", "sim.physics"}  # have a place of their own in tables
 UNNAMED |= {"format", "train.chunk", "train.save_every"}  # no result depends on them
+PARTS = {"parts": ""}  # of configs without parts of one's own
+OWN_LEARNER = "own learner"  # has no algorithm of the config's
 LENGTH = "train."  # settings of a run's length and shape do not make another method
 MOST_CHANGES = 6  # a variant with more is named by its folder
 DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_temperature": 0.0}
@@ -57,9 +59,10 @@ def variant(config: Json) -> Variant:
     changed = tuple(
         (name, _text(value))
         for name, value in settings.items()
-        if value != base.get(name, value) and name not in UNNAMED
+        if value != base.get(name, PARTS.get(name, value)) and name not in UNNAMED
     )
-    return Variant(preset, algo, changed)
+    has_learner = "learner " in settings.get("parts", "")
+    return Variant(preset, OWN_LEARNER if has_learner else algo, changed)
 
 
 @functools.cache
@@ -78,7 +81,7 @@ def _settings(text: str) -> Json:
 def label(variant: Variant, preset: bool = True, most: int | None = None) -> str:
     """Names a variant with at most `most` of its changes, or by its folder if it has many."""
     name = NAMES.get(variant.algo, variant.algo)
-    changed = [" ".join(change) for change in variant.changed]
+    changed = [" ".join(change).removeprefix("parts ") for change in variant.changed]
     if most is None and len(changed) > MOST_CHANGES and variant.source:
         changed = [variant.source]
     if most is not None and len(changed) > most:
@@ -95,8 +98,10 @@ def world(config: Json) -> tuple[str, str]:
 def train_command(config: Json) -> str:
     """Returns the command that trains with a recorded config."""
     made, (physics, _) = variant(config), world(config)
-    command = f"csac-jax train {made.preset} --algo {made.algo} --seed {config.get('seed', 0)}"
-    return f"{command} --sim.physics {physics}{_flags(made.changed)}"
+    algo, seed = config.get("algo", Config.algo), config.get("seed", 0)
+    command = f"csac-jax train {made.preset} --algo {algo} --seed {seed}"
+    command += f" --sim.physics {physics}{_flags(made.changed)}"
+    return f"{command}, by csac_jax.train with {config['parts']}" if "parts" in config else command
 
 
 def eval_command(asked: str, evaluated: Json, trained: Json) -> str:
@@ -125,6 +130,8 @@ def _flags(settings: Iterable[tuple[str, str]]) -> str:
     """Writes settings as options; a switch that is off is --SECTION.no-FIELD."""
     text = ""
     for name, value in settings:
+        if name in PARTS:
+            continue  # no option makes them
         section, _, field = name.replace("_", "-").rpartition(".")
         switch = {"True": field, "False": f"no-{field}"}.get(value, f"{field} {value}")
         text += f" --{section}.{switch}"

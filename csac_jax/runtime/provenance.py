@@ -13,6 +13,7 @@ import jax
 
 from csac_jax._version import __version__
 from csac_jax.errors import DataWarning
+from csac_jax.runtime import modules
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
@@ -62,5 +63,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def record() -> dict[str, object]:
-    """Returns device, versions and commit, for a result's JSON."""
-    return {"device": device(), "versions": versions(), "commit": commit()}
+    """Returns device, versions and commit, for a result's JSON, and modules of one's own."""
+    known: dict[str, object] = {"device": device(), "versions": versions(), "commit": commit()}
+    own = modules.digests()
+    return {**known, "modules": own} if own else known

@@ -15,6 +15,7 @@ from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.runner import SweepPlan, runs_of
+from csac_jax.training.own_parts import NO_PARTS, Parts
 from csac_jax.training.progress import Terminal
 
 OWN = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
@@ -22,7 +23,12 @@ SEED = 0  # of the evaluation: all policies of a point meet the same scenes
 
 
 def measure(
-    plan: SweepPlan, folder: Path, reporter: Terminal, stop: Stop, suite: str = OWN
+    plan: SweepPlan,
+    folder: Path,
+    reporter: Terminal,
+    stop: Stop,
+    suite: str = OWN,
+    own: Parts = NO_PARTS,
 ) -> int | None:
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
@@ -37,12 +43,17 @@ def measure(
         left = {path: paths[path] for path in saved if not path.exists()}
         if left and stop.signal is None:
             reporter.log(f"evaluating {point.name}: {len(left)} policies")
-            _measure_point(plan.episodes, suite, point.cfg, left, stop)
+            _measure_point(plan.episodes, suite, point.cfg, left, stop, own)
     return stop.signal
 
 
 def _measure_point(
-    episodes: int, suite: str, cfg: Config, left: dict[Path, Config], stop: Stop
+    episodes: int,
+    suite: str,
+    cfg: Config,
+    left: dict[Path, Config],
+    stop: Stop,
+    own: Parts = NO_PARTS,
 ) -> None:
     """Evaluates runs of one point, which share scenes and compiled episodes.
 
@@ -54,7 +65,7 @@ def _measure_point(
         if stop.signal is not None:
             return
         begun = time.time()
-        table = rollout.evaluate(policies.load(path.parent), prepared)
+        table = rollout.evaluate(policies.load(path.parent, own.network, own.learner), prepared)
         asked = {"policy": "learned", "suite": suite, "seed": SEED}
         seconds = {"seconds": round(time.time() - begun, 1)}
         measured = dataclasses.replace(prepared.cfg, seed=trained.seed)

@@ -22,6 +22,7 @@ from csac_jax.io import configs
 from csac_jax.nets import chunked_vmap
 from csac_jax.runtime import compiler
 from csac_jax.training import memory, programs, step
+from csac_jax.training.own_parts import NO_PARTS, Parts
 from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -124,8 +125,9 @@ class SweepProgram:
         """
         mesh, replicas, program = self.mesh, self.replicas, self.program
         vmapped = len(replicas.seed) // (self.parts if mesh is None else mesh.size)
-        assert isinstance(program.learner, CSAC)
-        learner = program.learner.batched(self._batching(vmapped))
+        learner = program.learner
+        if isinstance(learner, CSAC):
+            learner = learner.batched(self._batching(vmapped))
         by_scenes = mesh if self.shard == "scenes" else None
         program = dataclasses.replace(program, learner=learner, mesh=by_scenes)
 
@@ -180,10 +182,14 @@ class SweepProgram:
 
 
 def sweep_program(
-    group: ProgramGroup, mesh: Mesh | None = None, shard: Shard = "seeds", start: Any = None
+    group: ProgramGroup,
+    mesh: Mesh | None = None,
+    shard: Shard = "seeds",
+    start: Any = None,
+    own: Parts = NO_PARTS,
 ) -> SweepProgram:
-    """Makes the program of a group, with its environment."""
-    program = programs.make(group.configs[0])
+    """Makes the program of a group, with its environment and parts of one's own."""
+    program = programs.make(group.configs[0], **own._asdict())
     parts = num_parts(program.cfg, len(group.configs), mesh)
     return SweepProgram(program, group_replicas(group), mesh, shard, parts, start)
 

@@ -1,11 +1,14 @@
 """Callbacks of a run: trackers, evaluations during training, functions of your own."""
 
 import dataclasses
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from csac_jax.config import Config
+from csac_jax.io import configs, files
+from csac_jax.runtime import provenance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +74,24 @@ class Callback:
 
     def end(self, summary: Summary | None) -> None:
         """Runs after the last chunk; no summary if the run has failed."""
+
+
+class RunRecord(Callback):
+    """A callback that writes RUN/train.json: config, device, versions, commit; then the end."""
+
+    def __init__(self) -> None:
+        self._begun = time.time()
+
+    def begin(self, run: RunInfo) -> None:
+        self._path = run.run_dir / files.RECORD
+        self._known = {"config": configs.to_dict(run.cfg), **provenance.record()}
+        files.write_json(self._path, {"run_dir": str(run.run_dir), **self._known})
+
+    def end(self, summary: Summary | None) -> None:
+        if summary is not None:
+            end = {"run_dir": str(self._path.parent), **summary._asdict()}
+            seconds = {"wall_seconds": round(time.time() - self._begun, 1)}
+            files.write_json(self._path, end | seconds | self._known)
 
 
 @dataclasses.dataclass

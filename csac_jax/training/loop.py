@@ -166,6 +166,9 @@ def _begin(
 def check_resumable(cfg: Config, run_dir: Path, at: int | None = None) -> None:
     """Raises SettingsError if the run has other settings, CheckpointError if there is no run."""
     stored = checkpoint.load_config(run_dir, at)
+    if stored.parts != cfg.parts:
+        was, now = (one.parts or "no parts of one's own" for one in (stored, cfg))
+        raise SettingsError(f"{run_dir} was trained with {was}, not with {now}; give the same")
     longer = stored.change(train={"actions": max(stored.train.actions, cfg.train.actions)})
     if names := ", ".join(configs.differences(longer, cfg)):
         remedy = "leave them out, or begin a new run; only train.actions may grow"
@@ -179,6 +182,10 @@ def compile_program(
     reporter.log("compiling the training program; this takes a while, once")
     if cfg.sim.physics == "warp":
         reporter.log("then Warp builds its kernels, on a new machine for minutes")
+    if cfg.sim.physics == "mjx" and jax.default_backend() == "cpu":
+        reporter.log(
+            "MJX compiles for minutes on a CPU; physics c or auto does not: --sim.physics c"
+        )
     begun, hits = time.perf_counter(), cache.hits()
     program = compiler.lower(compile_chunk(cfg.train.chunk), state).compile()
     seconds = time.perf_counter() - begun

@@ -47,12 +47,12 @@ def make(
 
 
 def replace_hyperparams(program: Program, hyperparams: Hyperparams | None) -> Program:
-    """Replaces settings of a program of CSAC by values that may be traced."""
+    """Replaces settings of a program by values that may be traced; a custom learner keeps its."""
     if hyperparams is None:
         return program
-    cfg = replace_settings(program.cfg, hyperparams.values)
-    assert isinstance(program.learner, CSAC)
-    learner = program.learner.replace_hyperparams(cfg, hyperparams.return_bounds)
+    cfg, learner = replace_settings(program.cfg, hyperparams.values), program.learner
+    if isinstance(learner, CSAC):
+        learner = learner.replace_hyperparams(cfg, hyperparams.return_bounds)
     sampler = program.sampler.replace_hyperparams(cfg.replay)
     return dataclasses.replace(program, cfg=cfg, learner=learner, sampler=sampler)
 

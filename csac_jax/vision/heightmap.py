@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from csac_jax.config import HeightmapConfig
+from csac_jax.runtime import short
 
 VIEW_HEIGHT = 0.5  # m: blocks in play lie below it, parked blocks wholly above
 _HEIGHT_UNIT = 1e-4  # m per count of the packed height
@@ -22,6 +23,8 @@ class Observation:
     # [H, W] bool, a wanted block is seen; all True if any is wanted, all False if it is hidden
     target: jax.Array
     fingers: jax.Array | None = None  # [3] float32 m, `grippers.Fingers`; None where unseen
+
+    __repr__ = short.text
 
 
 @struct.dataclass

@@ -35,7 +35,9 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
     empty table is no failure: no decision, and a picture that says so."""
     files = ["--json", str(tmp_path / "out.json"), "--png", str(tmp_path / "out.png")]
     assert cli.main(["act", *given, "--top", "2", *files]) == 0
-    lines = capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr()
+    assert "trained with view exact maps from above, not noisy images of an obl" in printed.err
+    lines = printed.out.splitlines()
     result = json.loads((tmp_path / "out.json").read_text())
     wanted = CameraPolicy.load("shipped").decide(*IMAGE, top=2)
     assert len(lines) == len(result["decisions"]) == 2

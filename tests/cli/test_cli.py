@@ -1,6 +1,7 @@
 """The command line: bad input is one line and an exit code, and nothing is overwritten."""
 
 import dataclasses
+import hashlib
 import json
 import logging
 import os
@@ -24,12 +25,14 @@ from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.io import checkpoint
 from csac_jax.runtime import signals
 from csac_jax.section import Section
+from csac_jax.sweeps import runner
 from csac_jax.training import memory
-from csac_jax.training.callbacks import Summary
+from csac_jax.training.callbacks import RunInfo, RunRecord, Summary
 from csac_jax.training.progress import Terminal
 
 ROOT = Path(csac_jax.__file__).parents[1]
 SMOKE = presets.smoke()
+_STOPPED = runner.SweepResult({"settings": []}, [], 2)
 SUMMARY = Summary(4, 8, 1.5, 0.5, None, 0, None)
 
 
@@ -498,6 +501,68 @@ print("jax" in sys.modules)
     assert done.stdout == "False\n", done.stderr
 
 
+MODULE = """
+import csac_jax as csac
+from csac_jax.evaluation import policies, suites
+def one_box(cfg, episodes, stream):
+    scene = {"slots": ("box",), "min_blocks": 1, "packed_fraction": 0.0}
+    return csac.make_env(cfg.change(scene=scene, task={"max_actions": 1}), stream, episodes)
+csac.presets.register("mine", lambda: csac.presets.smoke().change(train={"actions": 32}))
+csac.algorithms.register("far", lambda cfg: cfg.change(target={"gamma": 0.7}))
+suites.register("one_box", one_box)
+policies.register("tired", policies.RandomPolicy)
+"""
+
+
+@pytest.mark.mjx
+def test_commands_load_modules(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    """Claim: presets, algorithms, suites and policies that a module of --import registers work in
+    train, sweep and eval; results name the module with a digest of its source. A module that is
+    missing or fails is one line."""
+    for module, name in ((presets, "PRESETS"), (algorithms, "ALGORITHMS"), (suites, "SUITES")):
+        monkeypatch.setattr(module, name, dict(getattr(module, name)))
+    monkeypatch.setattr(policies, "BASELINES", dict(policies.BASELINES))
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    Path("my_module.py").write_text(MODULE)
+    trained: list[Any] = []
+    monkeypatch.setattr(api, "train", lambda cfg, *_, **__: trained.append(cfg))
+    monkeypatch.setattr(api, "run_sweep", lambda plan, *_, **__: trained.append(plan) or _STOPPED)
+    assert cli.main(["train", "mine", "--import", "my_module", "--algo", "far"]) == 0
+    assert (
+        cli.main(
+            ["sweep", "mine", "--vary", "algo=csac,far", "--import", "my_module", "--seeds", "2"]
+        )
+        == 130
+    )
+    cfg, plan = trained
+    for one in (cfg, plan.points[1].cfg):
+        assert (one.preset, one.algo, one.target.gamma, one.train.actions) == (
+            "mine",
+            "far",
+            0.7,
+            32,
+        )
+    measure = "eval shipped --policy tired --suite one_box --episodes 2 --import my_module"
+    assert cli.main([*measure.split(), "--json", "eval.json"]) == 0
+    result = json.loads(Path("eval.json").read_text())
+    assert (result["policy"], result["suite"], result["counts"]["episodes"]) == (
+        "tired",
+        "one_box",
+        2,
+    )
+    assert result["modules"] == {"my_module": hashlib.sha256(MODULE.encode()).hexdigest()[:12]}
+    capsys.readouterr()
+    Path("my_fault.py").write_text("x = y")
+    for arguments, message in (
+        ("no_module", "'no_module' cannot be imported (ModuleNotFoundError: No module named"),
+        ("my_fault", "'my_fault' cannot be imported (NameError: name 'y' is not defined)"),
+        ("", "--import: give the name of a module"),
+    ):
+        _fails(capsys, 2, f"train smoke --import {arguments}", message)
+
+
 @pytest.mark.parametrize("code", [0, 130, 143])
 def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: int):
     """Claim: a stopped run exits with 128 + the signal; --json has the result, the config and where
@@ -505,7 +570,11 @@ def test_exit_code_and_json_of_a_run(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
     def trained(cfg, folder, stop, **_):
         stop.signal = code - 128 if code else None
-        return api.Run(folder, cfg, SUMMARY._replace(stopped_by=stop.signal), {})
+        summary, record = SUMMARY._replace(stopped_by=stop.signal), RunRecord()
+        record.begin(RunInfo(cfg, folder, 0))
+        assert "commit" in json.loads((folder / "train.json").read_text())  # of a killed run too
+        record.end(summary)
+        return api.Run(folder, cfg, summary, {})
 
     monkeypatch.setattr(api, "train", trained)
     assert cli.main(["train", "smoke", "--seed", "3", "--json", "out/result.json"]) == code

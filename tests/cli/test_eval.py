@@ -1,6 +1,8 @@
 """`csac-jax eval` over several suites."""
 
 import json
+import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,7 @@ import pytest
 
 from csac_jax import cli
 from csac_jax.cli import evaluate
+from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.report import suite_table
 
@@ -22,7 +25,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     calls: list[tuple[str, int]] = []
 
     def measure(
-        on_progress: Any, options: Any, changes: Any, suite: str, episodes: int
+        on_progress: Any, options: Any, changes: Any, suite: str, episodes: int, *_: Any
     ) -> dict[str, Any]:
         calls.append((suite, episodes))
         if len(calls) == 2:
@@ -92,6 +95,37 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
     assert cli.main(["eval", "shipped", *flags.split()]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
+
+
+def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: each suite is measured with the modules of --import, in a process of its own too."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", [*sys.path])
+    Path("my_empty.py").write_text("")
+    tasks: list[tuple] = []
+
+    def stopped(_: Any, some: list[tuple], *__: Any) -> None:
+        tasks.extend(some)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate.processes, "each", stopped)
+    flags = ["--policy", "random", "--suites", "cases", "tray", "--out", "out"]
+    assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 130
+    assert all("my_empty" in task[-1] for task in tasks)
+    assert len(tasks) == 2
+    options, changes, suite, episodes, _ = tasks[0]
+    with pytest.raises(SettingsError, match="'no_module' cannot be imported"):
+        evaluate._measure(lambda *_: None, options, changes, suite, episodes, ("no_module",))
+
+
+def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
+    """Claim: of a suite of objects the summary has a table by object, those first that stayed most
+    often, and no more than 12."""
+    objects = {f"cup{i}": {"episodes": 20, "gone": i} for i in range(20)}
+    evaluate.print_summary("pile", {"outcomes": {}, "counts": {}, "objects": objects})
+    printed = capsys.readouterr().out
+    assert "objects that stayed most often, of 20" in " ".join(printed.split())
+    assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
 
 
 @pytest.mark.mjx

@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import pytest
@@ -14,13 +15,14 @@ from rich.console import Console
 import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import doctor
+from csac_jax.config import Config
 from csac_jax.errors import FailedError, SceneError, SettingsError
 from csac_jax.io import checkpoint, policy_file
 from csac_jax.render import gl
 from csac_jax.runtime import cache, signals
 from csac_jax.sweeps import runner
 from csac_jax.training import loop, programs
-from csac_jax.training.callbacks import Summary
+from csac_jax.training.callbacks import RunInfo, Summary
 from csac_jax.training.progress import Terminal
 
 SMOKE = presets.smoke()
@@ -202,7 +204,14 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     and there is one line."""
     monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
     summary = Summary(*[0] * len(Summary._fields))
-    monkeypatch.setattr(loop, "run", lambda *_, **__: summary)
+
+    def run(cfg: Config, folder: Path, *others: Any) -> Summary:
+        (record,) = others[-1]
+        record.begin(RunInfo(cfg, folder, 0))
+        record.end(summary)
+        return summary
+
+    monkeypatch.setattr(loop, "run", run)
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
     assert Path("new/folder/out.json").is_file()
     assert Path("a/train.json").is_file()

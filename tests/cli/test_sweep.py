@@ -153,7 +153,7 @@ def test_study(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
         parts: Any = {"packed": cfg.scene.packed_fraction == 1.0}
         return PreparedSuite(suite, cfg, parts, episodes, seed)
 
-    monkeypatch.setattr(final.policies, "load", lambda folder: folder)
+    monkeypatch.setattr(final.policies, "load", lambda folder, *_: folder)
     monkeypatch.setattr(final.suites, "prepare", prepare)
     monkeypatch.setattr(final.rollout, "evaluate", measure)
     begun = cli.main(["sweep", "smoke", *STUDY.split(), "--evaluate", "4", "--run-dir", "run"])

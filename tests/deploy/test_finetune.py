@@ -20,7 +20,7 @@ from csac_jax.deploy import CameraPolicy, fine_tuning, record
 from csac_jax.deploy.decision import Decision
 from csac_jax.deploy.fine_tuning import Settings
 from csac_jax.deploy.record import Recorder, ReportedOutcome
-from csac_jax.errors import FailedError, SettingsError
+from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.vision import heightmap
@@ -153,14 +153,15 @@ def test_it_learns_what_works(policy: CameraPolicy, lesson: Path):
 
 def test_stop_keeps_what_was_learned(policy: CameraPolicy, lesson: Path):
     """Claim: a signal ends the learning after the step that runs, and its networks are returned;
-    one that came before keeps those that were given."""
+    one that came before keeps those that were given. Few actions are a warning."""
     stop, seen = Stop(), []
 
     def interrupt(*progress: float) -> None:
         seen.append(progress[:2])
         stop.signal = signal.SIGINT
 
-    tuned, done = fine_tuning.run(policy, lesson, SETTINGS, interrupt, stop)
+    with pytest.warns(DataWarning, match=r"has 12 actions; .* may get worse: record 100 or more"):
+        tuned, done = fine_tuning.run(policy, lesson, SETTINGS, interrupt, stop)
     assert (done.updates, done.stopped_by, seen) == (10, signal.SIGINT, [(10, 100)])
     again, none = fine_tuning.run(policy, lesson, SETTINGS, interrupt, stop)
     assert none.updates == 0

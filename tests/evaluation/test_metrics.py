@@ -9,6 +9,23 @@ from csac_jax.evaluation import metrics
 from csac_jax.evaluation.metrics import Episodes
 
 
+def test_objects_are_counted_by_hand():
+    """Claim: by object, the episodes that had it at the start, and those without it at the end."""
+    names = np.array([["cup", "ball", "cup"], ["ball", "cup", "pen"]])
+    in_play = np.array([[True, True, True], [True, True, False]])
+    left = np.array([[False, True, True], [False, False, False]])
+    counts = {"ball": {"episodes": 2, "gone": 1}, "cup": {"episodes": 3, "gone": 2}}
+    assert metrics.by_object(names, in_play, left) == counts
+
+
+def test_intervals_stay_within_their_bounds():
+    """Claim: an interval of a share lies in 0 .. 1, exactly, and holds its value."""
+    for n in range(1, 400):
+        for lifted in (0, n):
+            share = metrics.wilson(lifted, n)
+            assert 0.0 <= share["low"] <= share["value"] <= share["high"] <= 1.0
+
+
 @pytest.mark.parametrize(
     ("successes", "n"), [(0, 1), (1, 1), (0, 50), (50, 50), (1, 7), (47, 50), (1234, 4321)]
 )

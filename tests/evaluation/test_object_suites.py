@@ -31,5 +31,10 @@ def test_a_pile_ends_after_two_failures(monkeypatch: pytest.MonkeyPatch, tmp_pat
     found = rollout.evaluate(policies.RandomPolicy(env.cfg), prepared)
     assert found["scenes_sha256"] == rollout.object_slots.fingerprint(env.cfg.scene, env.scenes)
     assert found["declutter_rate"]["n"] == 15
+    counts, rows = found["counts"], found["objects"].values()
+    assert sum(row["episodes"] for row in rows) == counts["blocks"] == 15
+    assert sum(row["gone"] for row in rows) == counts["taken"] + counts["blocks_lost"]
+    names = {member.name for member in rollout.object_slots.library(env.cfg.scene).objects}
+    assert found["objects"].keys() <= names
     again = pool.settled(env.cfg, 1, 3, poured=True)
     assert rollout.object_slots.fingerprint(env.cfg.scene, again) == found["scenes_sha256"]

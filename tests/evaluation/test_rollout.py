@@ -2,7 +2,9 @@
 
 import dataclasses
 import heapq
-from typing import ClassVar
+import types
+import warnings
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -272,3 +274,36 @@ def test_oracle_beats_random_in_physics():
     efficiency = [e.cleared.sum() / e.valid.sum() for e in (oracle, random)]
     assert efficiency[0] > 1.3 * efficiency[1]
     assert oracle.completed.mean() >= 0.75
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"sim": {"gripper": "franka_hand"}}, "hand rg2, not franka_hand: expect less"),
+        ({"heightmap": {"view": "oblique"}}, "view exact maps from above, not exact images of an"),
+        ({"task": {"kind": "target"}}, "task take all, not get a marked one"),
+        ({"scene": {"slots": ("object",) * 5, "objects": "x"}}, "objects blocks, not objects of"),
+        ({"train": {"scenes": 1}, "sim": {"physics": "c"}}, None),
+    ],
+)
+def test_policies_say_what_they_were_not_made_for(
+    monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], text: str | None
+):
+    """Claim: an evaluation of networks warns in one line of a hand, view, task or objects that they
+    were not trained with; one of other policies does not, nor of what changes no decision."""
+    cfg = presets.quick().change(scene={"packed_fraction": 0.0}, sim={"physics": "auto"})
+    suite = suites.PreparedSuite(
+        "s", cfg, {"s": types.SimpleNamespace(cfg=cfg.change(**change), scenes=None)}, 1, 0
+    )
+    monkeypatch.setattr(rollout, "rollout", lambda *_: None)
+    monkeypatch.setattr(rollout.metrics, "summarise", lambda _: {})
+    monkeypatch.setattr(rollout.object_slots, "fingerprint", lambda *_: "")
+    monkeypatch.setattr(rollout, "_by_object", lambda *_: {})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rollout.evaluate(RandomPolicy(cfg), suite)
+        assert caught == []
+        rollout.evaluate(NetworkPolicy(cfg, None), suite)
+    lines = [str(warning.message) for warning in caught]
+    assert len(lines) == (text is not None)
+    assert all(text in line and "\n" not in line for line in lines)

@@ -422,7 +422,7 @@ def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     evaluation = {"policy": "learned", "suite": "cases", "seed": 5, "config": config}
     evaluation |= {"parts": {"a": part, "b": part}, "versions": {"jax": "1"}, "commit": "abc"}
     record = {"wall_seconds": 3.0, "config": config, "device": "cpu", "versions": {"jax": "1"}}
-    valid = {"eval.json": evaluation, files.CONFIG: config, results.RECORD: record}
+    valid = {"eval.json": evaluation, files.CONFIG: config, files.RECORD: record}
     valid[files.METRICS] = json.loads(_line(3))
     for name, content in valid.items():
         own = folder / name

@@ -62,12 +62,13 @@ def _step(
     actions: int = 1,
     diverged: bool = False,
     failed: int = 0,
+    objects: Any = None,
 ) -> Any:
     """The parts of a step that an episode's summary reads."""
     info = {"cleared": cleared, "blocks_lost": blocks_lost, "physics_diverged": np.bool_(diverged)}
     counts = {"actions": np.int32(actions), "failed_grasps": np.int32(failed)}
     after = {"info": SimpleNamespace(**info), "terminated": np.bool_(terminated), **counts}
-    scene = SimpleNamespace(target=target)
+    scene = SimpleNamespace(target=target, object_id=objects)
     return SimpleNamespace(after=SimpleNamespace(**after, reward=reward, scene=scene))
 
 
@@ -80,6 +81,8 @@ TAKEN = _step(cleared=1, reward=1.0, target=0, terminated=True)
     [
         ([_step(cleared=2), DONE], ("the table is clear", "3 blocks taken")),
         ([_step(blocks_lost=1, terminated=True)], ("no block is left", "0 blocks taken", LOST)),
+        ([_step(cleared=2, objects=(3, 4))], ("nothing changed", "2 objects taken")),
+        ([_step(blocks_lost=1, terminated=True, objects=(3,))], ("no object is left", "1 object")),
         ([_step(blocks_lost=1), TAKEN], ("the target is taken", "1 block taken", LOST)),
         ([_step(blocks_lost=1, target=0, terminated=True)], ("the target is lost", LOST)),
         ([_step(actions=30)], ("action limit",)),

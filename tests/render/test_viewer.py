@@ -30,7 +30,7 @@ seen, window = [], viewer._window
 @contextlib.contextmanager
 def counted(model):
     with window(model) as show:
-        yield lambda data, text: (seen.append(float(data.xpos[1, 2])), show(data, text))[1]
+        yield lambda data, *of: (seen.append(float(data.xpos[1, 2])), show(data, *of))[1]
 viewer._window = counted
 viewer.play(model, [("up", poses)], print, again=False)
 print(seen)
@@ -68,8 +68,8 @@ def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     Path("cube.json").write_text(json.dumps({"name": "cube", "blocks": [CUBE]}))
     show, pages, heights = viewer.Page.show, [], []
 
-    def watched(self: viewer.Page, data: mujoco.MjData, text: str) -> bool:
-        shown = show(self, data, text)
+    def watched(self: viewer.Page, data: mujoco.MjData, text: str, number: int) -> int:
+        following = show(self, data, text, number)
         if not pages:
             address = capsys.readouterr().out.split("open ")[1].split(" in a browser")[0]
             pages.append(urllib.request.urlopen(address, timeout=10).status)
@@ -81,13 +81,37 @@ def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
         heights.append(float(data.qpos[2]))
         if len(heights) == 30:  # 19 pictures an action: the second time
             raise KeyboardInterrupt
-        return shown
+        return following
 
     monkeypatch.setattr(viewer.Page, "show", watched)
     assert cli.main(["play", "--scene", "cube.json", "--viewer"]) == 0
     assert pages == [200]
     assert len(set(heights)) > 5
     assert heights[19:] == heights[:11]
+
+
+def test_page_can_be_controlled():
+    """Claim: the page shows one picture after the other; it stays while it is paused, goes to a
+    chosen picture and begins again on request."""
+    viser = pytest.importorskip("viser")
+    tiny = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='.1'/></worldbody></mujoco>"
+    )
+    data, server = mujoco.MjData(tiny), viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        page = viewer.Page(server, tiny, 9)
+        assert page.show(data, "up", 3) == 4
+        assert page.picture.value == 3
+        page.playing.value = False
+        assert page.show(data, "up", 4) == 4
+        page.choose(7)
+        assert [page.show(data, "up", 4), page.show(data, "up", 7)] == [7, 7]
+        page.playing.value = True
+        assert page.show(data, "up", 7) == 8
+        page.choose(0)
+        assert page.show(data, "up", 8) == 0
+    finally:
+        server.stop()
 
 
 @pytest.mark.slow

@@ -124,6 +124,47 @@ def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
     assert values == {10: [0.5] * 2, 40: [0.9] * 2}
 
 
+def test_command_loads_the_modules(tmp_path: Path):
+    """Claim: a recorded command loads the modules of one's own that the run or evaluation had."""
+    own = {"modules": {"mine": "0123456789ab"}}
+    _run(tmp_path / "a", _config("vpg", 0), [0.5], own)
+    _evaluation(tmp_path / "a" / "eval.json", _config("vpg", 0), 5)
+    content = json.loads((tmp_path / "a" / "eval.json").read_text()) | own
+    (tmp_path / "a" / "eval.json").write_text(json.dumps(content))
+    rows = result_tables.provenance(_report(tmp_path))
+    assert len(rows) == 2
+    assert all(row["settings as a command"].endswith(" --import mine") for row in rows)
+
+
+def test_own_parts_are_other_variants(tmp_path: Path):
+    """Claim: runs and evaluations with parts of one's own are named by them and not pooled with
+    others of the same config; with a learner of one's own no algorithm is named. Their command says
+    that an option does not make them."""
+    for name, parts in (("plain", {}), ("a", {"parts": "sampler my.Mine @0123456789ab"})):
+        for seed in range(2):
+            _run(tmp_path / name / f"seed-{seed}", _config("csac_beta", seed) | parts, [0.5, 0.6])
+            path = tmp_path / name / f"seed-{seed}/eval.json"
+            _evaluation(path, _config("csac_beta", seed) | parts, 5)
+    _run(tmp_path / "b", _config("csac_beta", 0) | {"parts": "learner my.Own @0123456789ab"}, [0.5])
+    report = _report(tmp_path)
+    names = {variants.label(curve.variant): len(curve.runs) for curve in report.curves}
+    mine = "CSAC-beta (paper), sampler my.Mine @0123456789ab"
+    own = "own learner (paper), learner my.Own @0123456789ab"
+    assert names == {"CSAC-beta (paper)": 2, mine: 2, own: 1}
+    assert {score.name: score.seeds for score in report.scores} == {"CSAC-beta (paper)": 2, mine: 2}
+    rows = result_tables.provenance(report)
+    commands = {row["file"]: row["settings as a command"] for row in rows}
+    by = ", by csac_jax.train with sampler my.Mine @0123456789ab"
+    assert commands["a/seed-0/metrics.jsonl"].endswith(by)
+    assert "parts" not in commands["a/seed-0/metrics.jsonl"]  # no option makes them
+    assert "parts" not in commands["a/seed-0/eval.json"]
+    assert " by " not in commands["plain/seed-0/metrics.jsonl"]
+    both = _report(tmp_path / "plain", tmp_path / "b")
+    charts = {chart.name: chart.figure for chart in figures.draw(both)}
+    legend = charts["variants-paper"].axes[0].get_legend()
+    assert legend.get_texts()[0].get_text() == "CSAC-beta (2)"
+
+
 def test_numbers_as_json(recorded: Path):
     """Claim: the JSON has every curve and score with its seeds, and where each number comes
     from."""
@@ -437,6 +478,17 @@ def test_figures(recorded: Path):
     assert (list(map(len, colours)), len(set(colours[1]))) == ([6, 3], 3)
 
 
+def test_methods_of_a_figure_have_colours_of_their_own():
+    """Claim: as many methods as a figure has are of different colours, an algorithm's first variant
+    of the same one everywhere."""
+    own = ["own learner", "mine", "another", "random", "geometric", "oracle"]
+    for methods in ([*variants.NAMES, *own], ["csac_beta"] * 12, [*own, "vpg", "vpg"]):
+        colours = figures._colours(methods)
+        assert len(set(colours)) == len(colours)
+        for algo in set(methods) & set(variants.NAMES):
+            assert colours[methods.index(algo)] == figures.COLOURS[algo]
+
+
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: `report --out` writes one page with its figures and media inside, and the tables as
     text; `--json` the numbers."""
@@ -458,6 +510,30 @@ def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.
     printed = capsys.readouterr().out
     assert (out / "results.md").read_text() in printed
     assert len(json.loads(numbers.read_text())["curves"]) == 3
+
+
+def test_page_is_a_file_or_a_folder(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: `--out` of a name in .html writes that file, and of another name a folder. What is
+    there as the other kind is one line, and so are relative and absolute runs together read."""
+    monkeypatch.chdir(recorded)
+    assert cli.main(["report", "vpg", str(recorded / "beta"), "--out", "new/page.html"]) == 0
+    text = capsys.readouterr().out
+    assert "| vpg/metrics.jsonl |" in text
+    assert "| beta/seed-0/metrics.jsonl |" in text
+    assert Path("new/page.html").read_text().startswith("<!doctype html>")
+    assert cli.main(["report", "vpg", "--out", "new"]) == 0
+    assert {path.name for path in Path("new").iterdir()} == {
+        "page.html",
+        "index.html",
+        "results.md",
+    }
+    Path("folder.html").mkdir()
+    capsys.readouterr()
+    for out, message in (("folder.html", "is a folder"), ("new/results.md", "is a file")):
+        assert cli.main(["report", "vpg", "--out", out]) == 2
+        assert f"--out: {out} {message}; name another" in capsys.readouterr().err
 
 
 def test_reads_without_jax(recorded: Path):

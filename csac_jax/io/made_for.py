@@ -1,0 +1,52 @@
+"""The world that a policy was trained in, in words, and a warning where it acts in another one."""
+
+import warnings
+
+from csac_jax import grippers
+from csac_jax.config import Config
+from csac_jax.errors import DataWarning
+
+TASKS = {"clear": "take all", "target": "get a marked one"}
+ABOVE = "exact maps from above"
+
+
+def task(cfg: Config) -> str:
+    """Returns the task of a config."""
+    return TASKS[cfg.task.kind]
+
+
+def objects(cfg: Config) -> str:
+    """Returns what lies in the scenes of a config."""
+    return "objects of many shapes" if cfg.scene.has_objects else "blocks"
+
+
+def hand(cfg: Config) -> str:
+    """Returns the hands that a policy of this config knows."""
+    return "any" if cfg.net.gripper else str(cfg.sim.gripper)
+
+
+def view(cfg: Config) -> str:
+    """Returns what a policy of this config sees."""
+    if cfg.heightmap.view == "ortho":
+        return ABOVE
+    noise = "exact" if cfg.sensor.kind == "none" else "noisy"
+    return f"{noise} images of an oblique camera"
+
+
+def warn_if_elsewhere(made: Config, used: Config) -> None:
+    """Warns, in one line, of a hand, view, task or objects that a policy was not trained with."""
+    same_hand = made.net.gripper or _fingers(made) == _fingers(used)
+    pairs = {
+        "hand": ("", "") if same_hand else (str(made.sim.gripper), str(used.sim.gripper)),
+        "view": (view(made), view(used)),
+        "task": (task(made), task(used)),
+        "objects": (objects(made), objects(used)),
+    }
+    others = [f"{name} {was}, not {now}" for name, (was, now) in pairs.items() if was != now]
+    if others:
+        text = f"this policy was trained with {'; '.join(others)}: expect less of it"
+        warnings.warn(f"{text}; csac-jax policies lists those that ship", DataWarning, stacklevel=3)
+
+
+def _fingers(cfg: Config) -> grippers.Fingers:
+    return grippers.load(cfg.sim.gripper).fingers
