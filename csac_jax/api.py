@@ -27,7 +27,7 @@ from csac_jax.sweeps import final, grid, replicas, runner
 from csac_jax.sweeps.runner import SweepPlan, SweepResult
 from csac_jax.training import loop, memory, own_parts, programs, sharding, split_step
 from csac_jax.training.callbacks import Callback, FunctionCallback, Record, RunRecord, Summary
-from csac_jax.training.own_parts import Parts
+from csac_jax.training.own_parts import OwnParts
 from csac_jax.training.progress import Terminal
 from csac_jax.training.step import TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -86,7 +86,7 @@ def train(
     TrainingError for a loss or parameter that is not finite, CheckpointError for nothing sound to
     resume or a disc that is full, LockedError for a run that another process trains.
     """
-    own = Parts(sampler, network, learner)
+    own = OwnParts(sampler, network, learner)
     own_parts.check(own, init)
     cfg = own_parts.named(backend.resolve(cfg), own)
     memory.check(cfg)
@@ -136,7 +136,7 @@ def train_fn(
     It does all steps of `train` with `jax.random.key(seed)`, without log or checkpoint, in any
     physics. Jit it, and vmap it over keys: `jax.jit(jax.vmap(train_fn(cfg)))(keys)`. T = steps.
     """
-    own = Parts(sampler, network, learner)
+    own = OwnParts(sampler, network, learner)
     own_parts.check(own)
     cfg = own_parts.named(backend.resolve(cfg), own)
     program = programs.make(cfg, **own._asdict())
@@ -173,7 +173,7 @@ def sweep(
     the sweep in run_dir, which has the same settings. Returns: the summary, grasp success of every
     combination over its seeds with 95 % intervals. Raises as `train`.
     """
-    own = Parts(sampler, network, learner)
+    own = OwnParts(sampler, network, learner)
     own_parts.check(own, init)
     own_parts.check_varied(own, vary or {})
     plan = SweepPlan(seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes)
@@ -196,7 +196,7 @@ def run_sweep(
     verbose: bool,
     stop: signals.Stop,
     resume: bool = False,
-    own: Parts = own_parts.NO_PARTS,
+    own: OwnParts = own_parts.NO_PARTS,
 ) -> SweepResult:
     """Runs what is left of a sweep's plan, see `sweep`, and writes its record."""
     begun = time.time()

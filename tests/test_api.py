@@ -269,7 +269,7 @@ def test_run_names_its_own_parts(tmp_path: Path, capsys: pytest.CaptureFixture):
     quiet: Any = {"stop": stop, "verbose": False}
     run = api.train(SMOKE, tmp_path / "mine", sampler=mine, **quiet)
     api.train(SMOKE, tmp_path / "plain", **quiet)
-    name = own_parts.Parts(mine).names()
+    name = own_parts.OwnParts(mine).names()
     assert name.startswith(f"sampler {__name__}.Newest(share=0.5) @")
     stored = [configs.load_config(run.run_dir / "config.json"), checkpoint.load_config(run.run_dir)]
     assert [run.cfg.parts, *(cfg.parts for cfg in stored)] == [name] * 3
@@ -311,7 +311,7 @@ def test_sweep_takes_own_parts(tmp_path: Path, own: Any):
     asked: Any = {"vary": vary, "run_dir": tmp_path / "sweep", "episodes": 2, "verbose": False}
     summary = api.sweep(cfg, 2, **asked, **own)
     assert summary["complete"]
-    names = own_parts.Parts(**own).names()
+    names = own_parts.OwnParts(**own).names()
     configured = list((tmp_path / "sweep").glob("*/seed-*/config.json"))
     assert len(configured) == 4
     assert {configs.load_config(path).parts for path in configured} == {names}
@@ -394,7 +394,7 @@ def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, 
     (group,) = group_configs([dataclasses.replace(plan.points[0].cfg, seed=k) for k in range(2)])
     make_program(group)
     ((asked, mesh, shard, start, own),) = given
-    assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.Parts(mine))
+    assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.OwnParts(mine))
     assert made(group, own=own).program.sampler is mine
     _assert_same(start(_learner_state(SMOKE)).online, params)
 

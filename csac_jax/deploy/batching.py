@@ -19,7 +19,7 @@ class FullError(Exception):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Entry:
+class Pending:
     """An item that waits, and where its answer goes."""
 
     item: Any
@@ -36,7 +36,7 @@ class Batcher:
 
     def __init__(
         self,
-        answer: Callable[[list[Entry]], Sequence[Any]],
+        answer: Callable[[list[Pending]], Sequence[Any]],
         batch_size: Callable[[Sequence[Any]], int],
         threads: int,
     ) -> None:
@@ -46,7 +46,7 @@ class Batcher:
         how many of the first items go together.
         """
         self._answer, self._batch_size = answer, batch_size
-        self._waiting: collections.deque[Entry] = collections.deque()
+        self._waiting: collections.deque[Pending] = collections.deque()
         self._pool = ThreadPoolExecutor(threads, "decide")
         self._threads = self._free = threads
         self._pace = 0.0  # s per item, of one thread
@@ -63,7 +63,7 @@ class Batcher:
         """Returns the answer to an item. Cancel it to give up. Raises FullError."""
         if self.is_full:
             raise FullError("too many requests wait; ask again later")
-        entry = Entry(item, asyncio.get_running_loop().create_future())
+        entry = Pending(item, asyncio.get_running_loop().create_future())
         self._waiting.append(entry)
         if self._free:
             self._free -= 1

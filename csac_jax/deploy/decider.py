@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 
 from csac_jax.deploy import CameraPolicy
-from csac_jax.deploy.batching import Entry
+from csac_jax.deploy.batching import Pending
 from csac_jax.deploy.record import Image, Recorder
 from csac_jax.deploy.requests import MOST_PIXELS, Question
 from csac_jax.section import require
@@ -53,7 +53,7 @@ class Decider:
         """`size` of images, px, is always taken."""
         self._policy, self._recorder, self._sizes = policy, recorder, {size}
 
-    def answer(self, batch: list[Entry]) -> list[bytes | Exception]:
+    def answer(self, batch: list[Pending]) -> list[bytes | Exception]:
         """Returns the JSON of each answer, or the reason why there is none."""
         begun = time.perf_counter()
         views = [self._view(entry.item) for entry in batch]
@@ -82,7 +82,7 @@ class Decider:
             return error
 
     def _finish(
-        self, entry: Entry, view: View, decisions: list[Any], milliseconds: float
+        self, entry: Pending, view: View, decisions: list[Any], milliseconds: float
     ) -> bytes | Exception:
         """Records the decisions, unless the client has left."""
         if entry.has_left:

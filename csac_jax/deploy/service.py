@@ -54,8 +54,8 @@ _FAULTS: dict[int | str, dict[str, Any]] = {
 }
 
 
-class Bodies:
-    """Readers of bodies, within bounds of size, time and memory."""
+class BodyReaders:
+    """Readers of bodies of requests, within bounds of size, time and memory."""
 
     def __init__(self) -> None:
         self._held = 0  # bytes
@@ -144,7 +144,8 @@ def make(
             raise _refused(401, "send the header Authorization: Bearer TOKEN")
 
     batcher = Batcher(Decider(policy, recorder, size).answer, batch_size, THREADS)
-    bodies, disc, parsers = Bodies(), ThreadPoolExecutor(1, "disc"), ThreadPoolExecutor(2, "parse")
+    bodies, parsers = BodyReaders(), ThreadPoolExecutor(2, "parse")
+    disc = ThreadPoolExecutor(1, "disc")
     about = {"task": policy.cfg.task.kind, "extent": policy.cfg.heightmap.extent}
     versions = {"policy": source, **about, "versions": provenance.versions()}
     app = fastapi.FastAPI(

@@ -257,7 +257,7 @@ def load(
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
-    own_parts.check_loadable(folder, cfg, own_parts.Parts(network=network, learner=learner))
+    own_parts.check_loadable(folder, cfg, own_parts.OwnParts(network=network, learner=learner))
     state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)

@@ -15,7 +15,7 @@ from csac_jax.io import checkpoint, configs, files
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps.runner import SweepPlan, runs_of
-from csac_jax.training.own_parts import NO_PARTS, Parts
+from csac_jax.training.own_parts import NO_PARTS, OwnParts
 from csac_jax.training.progress import Terminal
 
 OWN = suites.IN_DISTRIBUTION  # every task has its own scenes, from other random numbers
@@ -28,7 +28,7 @@ def measure(
     reporter: Terminal,
     stop: Stop,
     suite: str = OWN,
-    own: Parts = NO_PARTS,
+    own: OwnParts = NO_PARTS,
 ) -> int | None:
     """Evaluates the policies that are left, each in `plan.episodes` episodes of the suite's parts.
     A run that was given up has no policy. Returns the number of the signal that stopped it. Raises
@@ -53,7 +53,7 @@ def _measure_point(
     cfg: Config,
     left: dict[Path, Config],
     stop: Stop,
-    own: Parts = NO_PARTS,
+    own: OwnParts = NO_PARTS,
 ) -> None:
     """Evaluates runs of one point, which share scenes and compiled episodes.
 

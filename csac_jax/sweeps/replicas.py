@@ -22,7 +22,7 @@ from csac_jax.io import configs
 from csac_jax.nets import chunked_vmap
 from csac_jax.runtime import compiler
 from csac_jax.training import memory, programs, step
-from csac_jax.training.own_parts import NO_PARTS, Parts
+from csac_jax.training.own_parts import NO_PARTS, OwnParts
 from csac_jax.training.sharding import AXIS, Shard
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
@@ -186,7 +186,7 @@ def sweep_program(
     mesh: Mesh | None = None,
     shard: Shard = "seeds",
     start: Any = None,
-    own: Parts = NO_PARTS,
+    own: OwnParts = NO_PARTS,
 ) -> SweepProgram:
     """Makes the program of a group, with its environment and parts of one's own."""
     program = programs.make(group.configs[0], **own._asdict())

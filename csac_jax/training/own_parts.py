@@ -37,7 +37,7 @@ UNREAD = {
 _UNNAMED = {"parent", "name"}  # fields that Flax adds to a module
 
 
-class Parts(NamedTuple):
+class OwnParts(NamedTuple):
     """A sampler, a network and a learner in place of the config's; None for the config's."""
 
     sampler: Sampler | None = None
@@ -50,7 +50,7 @@ class Parts(NamedTuple):
         return SEPARATOR.join(f"{kind} {name(part)}" for kind, part in given)
 
 
-NO_PARTS = Parts()
+NO_PARTS = OwnParts()
 
 
 def name(part: Any) -> str:
@@ -109,7 +109,7 @@ def _source(of: Any) -> str:
         return of.__qualname__
 
 
-def check(parts: Parts, init: Any = None) -> None:
+def check(parts: OwnParts, init: Any = None) -> None:
     """Raises SettingsError for a part that is none, and for one that `init` has no networks for."""
     for kind, part in parts._asdict().items():
         if part is None:
@@ -123,7 +123,7 @@ def check(parts: Parts, init: Any = None) -> None:
     require(plain, "init: has the config's own networks; leave out network and learner")
 
 
-def named(cfg: Config, parts: Parts) -> Config:
+def named(cfg: Config, parts: OwnParts) -> Config:
     """Returns the config with the names of the parts. Raises SettingsError if it has other ones."""
     names = parts.names()
     if cfg.parts not in ("", names):
@@ -133,7 +133,7 @@ def named(cfg: Config, parts: Parts) -> Config:
     return cfg.change(parts=names)
 
 
-def check_varied(parts: Parts, names: Iterable[str]) -> None:
+def check_varied(parts: OwnParts, names: Iterable[str]) -> None:
     """Raises SettingsError for a varied setting that a part does not read."""
     for kind, part in parts._asdict().items():
         unread = [one for one in names if part is not None and one.startswith(UNREAD[kind])]
@@ -141,7 +141,7 @@ def check_varied(parts: Parts, names: Iterable[str]) -> None:
         require(not read, f"vary: your {kind} does not read {', '.join(read)}; leave it out")
 
 
-def check_loadable(source: Any, cfg: Config, parts: Parts) -> None:
+def check_loadable(source: Any, cfg: Config, parts: OwnParts) -> None:
     """Raises SettingsError if a policy lacks the network or learner of its run; warns of others."""
     lacking = {kind: part is None for kind, part in parts._asdict().items() if kind != "sampler"}
     for text in cfg.parts.split(SEPARATOR) if cfg.parts else []:

@@ -16,7 +16,7 @@ from csac_jax import presets
 from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.io import configs
 from csac_jax.training import own_parts
-from csac_jax.training.own_parts import Parts
+from csac_jax.training.own_parts import OwnParts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,19 +87,19 @@ def test_name_has_what_a_part_was_made_with():
     assert names == [own_parts.name(Mine(table=value)) for value in held]
     assert own_parts.name(Child()).partition("@")[2] != one.partition("@")[2]
     assert own_parts.name(Net()).startswith(f"{__name__}.Net(width=4, stride=2) @")
-    assert Parts(Mine(), Net()).names() == f"sampler {one}; network {own_parts.name(Net())}"
-    assert Parts().names() == ""
+    assert OwnParts(Mine(), Net()).names() == f"sampler {one}; network {own_parts.name(Net())}"
+    assert OwnParts().names() == ""
 
 
 def test_config_has_the_names():
     """Claim: a config with parts of its own survives its file; one without is as earlier versions
     wrote it. Other parts than its own are refused in one line."""
-    cfg = own_parts.named(presets.smoke(), Parts(Mine()))
+    cfg = own_parts.named(presets.smoke(), OwnParts(Mine()))
     assert cfg.parts == f"sampler {own_parts.name(Mine())}"
     assert configs.from_dict(configs.to_dict(cfg)) == cfg
     assert "parts" not in configs.to_dict(presets.smoke())
-    assert own_parts.named(cfg, Parts(Mine())) == cfg
-    for other in (Parts(), Parts(Mine(share=0.5)), Parts(Mine(), Net())):
+    assert own_parts.named(cfg, OwnParts(Mine())) == cfg
+    for other in (OwnParts(), OwnParts(Mine(share=0.5)), OwnParts(Mine(), Net())):
         with pytest.raises(
             SettingsError, match=r"^parts: these settings are of a run with sampler"
         ):
@@ -130,9 +130,9 @@ def test_what_is_no_part_is_refused(
 
 def test_settings_that_a_part_does_not_read_cannot_be_varied():
     """Claim: a sweep of settings that a part of one's own takes the place of is refused."""
-    own_parts.check_varied(Parts(Mine()), ["learn.tau", "replay.capacity"])
-    own_parts.check_varied(Parts(), ["replay.end"])
-    for parts, name in ((Parts(Mine()), "replay.end"), (Parts(network=Net()), "net.growth")):
+    own_parts.check_varied(OwnParts(Mine()), ["learn.tau", "replay.capacity"])
+    own_parts.check_varied(OwnParts(), ["replay.end"])
+    for parts, name in ((OwnParts(Mine()), "replay.end"), (OwnParts(network=Net()), "net.growth")):
         with pytest.raises(SettingsError, match=f"^vary: your .* does not read {name}"):
             own_parts.check_varied(parts, [name])
 
@@ -141,11 +141,16 @@ def test_policies_need_their_own_parts():
     """Claim: a run's policy needs the network or learner of the run, not its sampler; one of
     another source is a warning. Older runs name none."""
     sampled, own = (
-        own_parts.named(presets.smoke(), parts) for parts in (Parts(Mine()), Parts(network=Net()))
+        own_parts.named(presets.smoke(), parts)
+        for parts in (OwnParts(Mine()), OwnParts(network=Net()))
     )
-    for cfg, parts in ((sampled, Parts()), (own, Parts(network=Net())), (presets.smoke(), Parts())):
+    for cfg, parts in (
+        (sampled, OwnParts()),
+        (own, OwnParts(network=Net())),
+        (presets.smoke(), OwnParts()),
+    ):
         own_parts.check_loadable("run", cfg, parts)
     with pytest.raises(SettingsError, match=r"^run was trained with network .*; give it: csac_jax"):
-        own_parts.check_loadable("run", own, Parts())
+        own_parts.check_loadable("run", own, OwnParts())
     with pytest.warns(DataWarning, match=r"^run was trained with network .*width=4.*width=5"):
-        own_parts.check_loadable("run", own, Parts(network=Net(width=5)))
+        own_parts.check_loadable("run", own, OwnParts(network=Net(width=5)))
