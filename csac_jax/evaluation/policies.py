@@ -260,7 +260,7 @@ def policy_from_state(
 def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
     if which != "best":
         return run_dir, None if which == "last" else int(which)
-    if not (best := run_dir / files.BEST).exists():
+    if not (best := files.inside(run_dir, files.BEST)).exists():
         raise FileNotFoundError(f"there is no {best}; a run keeps its best with eval_every")
     return best, None
 

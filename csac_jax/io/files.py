@@ -10,14 +10,16 @@ import contextlib
 import errno
 import json
 import os
+import secrets
 import shutil
 import stat
 import sys
+import time
 import warnings
 from pathlib import Path
 from typing import Any
 
-from csac_jax.errors import DataWarning
+from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import renames
 
 CONFIG = "config.json"
@@ -26,22 +28,62 @@ EVALUATIONS = "evaluations.jsonl"
 SWEEP_PLAN = "sweep.json"
 BEST = "best"
 LARGEST = 2**30  # bytes of a file that is read at once
+STALE = 3600.0  # s without a change, after which a draft is that of a killed process
+_DRAFT = ".csac-jax-{}.tmp"  # of a random number: two processes never share a draft
+
+
+class LinkError(FailedError):
+    """A path of a run or sweep that is a link."""
+
+
+def inside(folder: Path, *names: str | Path) -> Path:
+    """Returns a path below the folder of a run or sweep, which itself may be a link.
+
+    Raises LinkError if there is a link below the folder.
+    """
+    path = folder
+    for part in Path(*names).parts:
+        path = path / part
+        if part == ".." or path.is_symlink():
+            raise LinkError(f"{path} is a link; put a folder or file of the run in its place")
+    return path
 
 
 def replace(path: Path, content: str | bytes) -> None:
-    """Writes a file at once, or raises OSError and leaves nothing. Creates its folder."""
+    """Writes a file at once, or raises OSError and leaves nothing. Creates its folder.
+
+    A link in its place is replaced and its target stays.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
+    draft = path.with_name(_DRAFT.format(secrets.token_hex(8)))
     try:
-        with temporary.open("wb") as file:
+        with draft.open("xb") as file:  # x follows no link
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())  # else a power failure may leave it empty
-        temporary.replace(path)
+        draft.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+            draft.unlink(missing_ok=True)
         raise
+
+
+def append(path: Path, line: str) -> None:
+    """Adds a line to a log. Raises OSError where the log is a link."""
+
+    def opener(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NOFOLLOW, 0o666)
+
+    with open(path, "a", opener=opener) as log:
+        log.write(f"{line}\n")
+
+
+def remove_drafts(folder: Path) -> None:
+    """Removes drafts that killed processes left in a folder, once they are STALE."""
+    for draft in folder.glob(_DRAFT.format("*")):
+        with contextlib.suppress(OSError):
+            if time.time() - draft.lstat().st_mtime > STALE:
+                draft.unlink()
 
 
 def sync_folder(folder: Path) -> None:

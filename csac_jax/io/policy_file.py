@@ -50,6 +50,7 @@ def save(path: Path, params: Params, cfg: Config) -> None:
     stored = configs.to_dict(cfg.change(sim={"gripper": gripper}))
     remarks = {_CONFIG: json.dumps(stored), _VERSIONS: json.dumps(provenance.versions())}
     remarks[_DIGEST] = _digest(remarks, tensors)
+    files.remove_drafts(path.parent)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
 
 

@@ -1,5 +1,6 @@
 """Checkpoints: what comes back, and what is refused."""
 
+import contextlib
 import dataclasses
 import json
 import shutil
@@ -17,7 +18,7 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.errors import DataWarning
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.io.checkpoint import CheckpointError
 
 CFG = presets.smoke()
@@ -105,6 +106,27 @@ def test_last_two_are_kept(run_dir: Path):
     names = {path.name for path in (run_dir / "checkpoints").iterdir()}
     assert {name for name in names if name.isdigit()} == {"8", "12"}
     assert checkpoint.latest_step(run_dir) == 12
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "set-aside", ".saving", "2", "12"])
+def test_links_are_not_followed(run_dir: Path, tmp_path_factory: pytest.TempPathFactory, name: str):
+    """Claim: a link among a run's checkpoints is refused, or replaced, and its target stays."""
+    other, root = tmp_path_factory.mktemp("other"), run_dir / "checkpoints"
+    checkpoint.save(other, 3, _state(3), CFG, {})
+    (other / "checkpoints" / "run").unlink()  # an old one, which no name gives away
+    place, target = root / name, other / "checkpoints" / "3"
+    if name == "checkpoints":
+        place, target = root, other / "checkpoints"
+        root.rename(run_dir / "away")
+    place.symlink_to(target)
+    before = [(path, path.read_bytes()) for path in sorted(other.rglob("*")) if path.is_file()]
+    with contextlib.suppress(files.LinkError):
+        checkpoint.save(run_dir, 12, _state(12), CFG, {})
+        checkpoint.set_aside_after(run_dir, 8)
+        checkpoint.remove(run_dir)
+    after = [(path, path.read_bytes()) for path in sorted(other.rglob("*")) if path.is_file()]
+    assert after == before
+    assert place.is_symlink() == (name in ("checkpoints", "set-aside"))
 
 
 def test_temporary_folders_are_removed(run_dir: Path):
