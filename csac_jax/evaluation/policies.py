@@ -22,7 +22,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, files, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
-from csac_jax.training import programs
+from csac_jax.training import memory, programs
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
@@ -242,7 +242,12 @@ def load(
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
-    state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
+    shapes = programs.abstract_state(cfg, learner, network)
+    needed, room = memory.tree_bytes(shapes) / memory.GIB, memory.limit() / memory.GIB
+    if needed > room:
+        fault = f"its state takes {needed:.1f} GiB, there are {room:.1f}"
+        raise checkpoint.CheckpointError(f"{folder}: {fault}; use a machine with more memory")
+    state, _ = checkpoint.restore(folder, shapes, step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)
     return policy_from_state(cfg, state.learner, network, learner)

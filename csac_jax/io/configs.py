@@ -18,11 +18,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from csac_jax import algorithms, grippers, presets
+from csac_jax import algorithms, grippers, presets, reading
 from csac_jax.config import Config, SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
-from csac_jax.io import files, renames
+from csac_jax.io import renames
 from csac_jax.section import (
     ALTERNATIVES,
     Section,
@@ -34,6 +34,7 @@ from csac_jax.section import (
 )
 
 FORMAT = 2
+_LARGEST = 2**20  # bytes of a config file
 
 
 def to_dict(cfg: Config) -> dict[str, Any]:
@@ -176,7 +177,7 @@ def _read(path: Path) -> dict[str, Any]:
     if path.suffix not in READERS:
         raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
     kind, parse = READERS[path.suffix]
-    text = files.read_bytes(path).decode()
+    text = reading.read_bytes(path, _LARGEST).decode()
     try:
         content = json.loads(json.dumps(parse(text), default=str))
     except RecursionError:

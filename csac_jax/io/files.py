@@ -7,12 +7,10 @@ RUN/best/, RUN/evaluations.jsonl    see `evaluation.monitor`
 """
 
 import contextlib
-import errno
 import json
 import os
 import secrets
 import shutil
-import stat
 import sys
 import time
 import warnings
@@ -21,13 +19,15 @@ from typing import Any
 
 from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import renames
+from csac_jax.reading import read_bytes
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 EVALUATIONS = "evaluations.jsonl"
 SWEEP_PLAN = "sweep.json"
 BEST = "best"
-LARGEST = 2**30  # bytes of a file that is read at once
+LARGEST_JSON = 2**27  # bytes of a file of one JSON value, whose objects take ten times as much
+_LONGEST_LINE = 2**22  # bytes of a line of a log
 STALE = 3600.0  # s without a change, after which a draft is that of a killed process
 _DRAFT = ".csac-jax-{}.tmp"  # of a random number: two processes never share a draft
 
@@ -102,7 +102,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def read_object(path: Path) -> dict[str, Any]:
     """Returns the JSON object of a file. Raises ValueError for other content, OSError."""
-    content = parse(read_bytes(path), path.name)
+    content = parse(read_bytes(path, LARGEST_JSON), path.name)
     if not isinstance(content, dict):
         raise ValueError(f"{path.name} holds no JSON object")
     return content
@@ -114,18 +114,6 @@ def parse(text: str | bytes, name: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         raise ValueError(f"{name} is not readable JSON") from None
-
-
-def read_bytes(path: Path) -> bytes:
-    """Returns the content of a regular file.
-
-    Raises OSError for a pipe or device, which may never end, and for more than LARGEST.
-    """
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
-        reason = "is a folder, a pipe or a device, or larger than 1 GiB"
-        raise OSError(errno.EINVAL, reason, str(path))
-    return path.read_bytes()
 
 
 def first_line(error: BaseException) -> str:
@@ -150,6 +138,8 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     """Returns a line of a log, None if it is damaged or lacks a required number."""
+    if len(line) > _LONGEST_LINE:
+        return None
     try:
         record = renamed(parse(line, "line"))
     except ValueError:

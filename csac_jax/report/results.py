@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac_jax import reading
 from csac_jax.errors import SettingsError
 from csac_jax.io import files, renames
 from csac_jax.report import variants
@@ -133,7 +134,7 @@ def _opened(path: Path) -> Iterator[Path]:
 def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Writes a regular file of an archive; skips links and what would lie elsewhere."""
     place = (folder / member.name).resolve()
-    sound = member.isreg() and member.size <= files.LARGEST and place.is_relative_to(folder)
+    sound = member.isreg() and member.size <= reading.LARGEST and place.is_relative_to(folder)
     if sound and (content := archive.extractfile(member)):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content.read())
@@ -225,7 +226,7 @@ def _record(folder: Path, config: Json) -> Json:
 
 
 def _evaluations(file: Path, path: Path) -> list[Evaluation]:
-    content = files.parse(files.read_bytes(file), "the file")
+    content = files.parse(reading.read_bytes(file, files.LARGEST_JSON), "the file")
     kinds = [{"policy", "config", name} for name in ("parts", "grasp_success")]
     if not isinstance(content, dict) or not any(kind <= content.keys() for kind in kinds):
         return []
