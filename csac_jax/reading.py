@@ -22,7 +22,7 @@ def check_regular(path: Path, largest: int = LARGEST) -> None:
     """Raises OSError for a pipe or device, which may never end, and for more than `largest`."""
     status = path.stat()
     if not stat.S_ISREG(status.st_mode) or status.st_size > largest:
-        reason = f"is a folder, a pipe or a device, or larger than {largest >> 20} MiB"
+        reason = f"is a folder, a pipe or a device, or larger than {largest >> 10} KiB"
         raise OSError(errno.EINVAL, reason, str(path))
 
 

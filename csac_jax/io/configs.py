@@ -34,7 +34,9 @@ from csac_jax.section import (
 )
 
 FORMAT = 2
-_LARGEST = 2**20  # bytes of a config file
+_LARGEST = 2**17  # bytes of a config file
+_LONGEST_LINE = 2**12  # bytes in TOML, whose parser takes the square of a key's parts
+_MOST_BRACKETS = 1000  # in YAML, whose scanner takes the square of their number
 
 
 def to_dict(cfg: Config) -> dict[str, Any]:
@@ -189,10 +191,18 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
+def _toml(text: str) -> Any:
+    longest = max(map(len, text.splitlines()), default=0)
+    require(longest <= _LONGEST_LINE, f"has a line of {longest} characters; break it")
+    return tomllib.loads(text)
+
+
 def _yaml(text: str) -> Any:
     """Reads plain values. Refuses aliases: a short file could stand for an endless one."""
     import yaml
 
+    brackets = text.count("[") + text.count("{")
+    require(brackets <= _MOST_BRACKETS, f"has {brackets} brackets, more than {_MOST_BRACKETS}")
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise SettingsError("aliases (*name) are not read; write the values out")
@@ -202,7 +212,7 @@ def _yaml(text: str) -> Any:
 
 
 READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
-    ".toml": ("TOML", tomllib.loads),
+    ".toml": ("TOML", _toml),
     ".yaml": ("YAML", _yaml),
     ".yml": ("YAML", _yaml),
     ".json": ("JSON", json.loads),

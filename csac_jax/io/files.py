@@ -58,7 +58,7 @@ def replace(path: Path, content: str | bytes) -> None:
     draft = path.with_name(_DRAFT.format(secrets.token_hex(8)))
     try:
         with draft.open("xb") as file:  # x follows no link
-            file.write(content.encode() if isinstance(content, str) else content)
+            file.write(_encoded(content))
             file.flush()
             os.fsync(file.fileno())  # else a power failure may leave it empty
         draft.replace(path)
@@ -66,6 +66,11 @@ def replace(path: Path, content: str | bytes) -> None:
         with contextlib.suppress(OSError):
             draft.unlink(missing_ok=True)
         raise
+
+
+def _encoded(content: str | bytes) -> bytes:
+    """Encodes text; a name that is no UTF-8 appears with escapes."""
+    return content.encode(errors="backslashreplace") if isinstance(content, str) else content
 
 
 def append(path: Path, line: str) -> None:

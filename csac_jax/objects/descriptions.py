@@ -35,7 +35,7 @@ def read(path: Path) -> Any:
     _check_named(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        spec.assets = _whole_files(spec, path.parent.resolve())
+        spec.assets = _whole_files(spec, path.parent)
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(" ".join(str(error).split())[:200]) from None

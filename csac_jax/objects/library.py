@@ -124,7 +124,7 @@ def load(folder: Path) -> Library:
     """Loads the library in a folder. Raises LibraryError, one line with the remedy."""
     try:
         index = reading.read_bytes(folder / INDEX, _MOST_BYTES[INDEX])
-        key = (str(folder.resolve()), hashlib.sha256(index).hexdigest())
+        key = (os.path.realpath(folder), hashlib.sha256(index).hexdigest())
         if key not in _LOADED:
             _LOADED[key] = Library(tuple(_read(folder, index)), key[1])
         return _LOADED[key]

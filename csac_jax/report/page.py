@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import csac_jax
+from csac_jax.io import files
 from csac_jax.report import figures, result_tables, results
 from csac_jax.report.comparison import ResultReport
 
@@ -22,10 +23,9 @@ MOST_MEDIA = 12
 def write(report: ResultReport, paths: Sequence[Path], folder: Path) -> list[Path]:
     """Writes index.html, which needs no other file, and results.md. Pictures and videos that lie in
     `paths`, as `play` writes them, are in the page."""
-    folder.mkdir(parents=True, exist_ok=True)
     pages = {"index.html": render(report, paths), "results.md": result_tables.markdown(report)}
     for name, text in pages.items():
-        (folder / name).write_text(text)
+        files.replace(folder / name, text)
     return [folder / name for name in pages]
 
 

@@ -216,7 +216,7 @@ def _totals(lines: Sequence[Json]) -> dict[str, int]:
 
 def _record(folder: Path, config: Json) -> Json:
     """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
-    above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
+    above = Path(os.path.realpath(folder)).parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
         record = _read_json(place / RECORD)
         _check(record, _RECORD, RECORD)
@@ -276,7 +276,7 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 def _variant(file: Path, path: Path, config: Json) -> Variant:
     """Builds the variant of a file. Its source is the folder; of several seeds, the one above. An
     evaluation's source also names its file. Its robot is that of the run."""
-    folder = path.resolve().parent
+    folder = Path(os.path.realpath(path)).parent
     source = folder.parent.name if folder.name.startswith("seed-") else folder.name
     if path.name != files.METRICS:
         _, robot = variants.world(_read_json(file.parent / files.CONFIG))

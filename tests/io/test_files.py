@@ -36,6 +36,12 @@ def test_a_planted_link_is_not_written_through(tmp_path: Path, name: str):
     assert not (tmp_path / "a.json").is_symlink()
 
 
+def test_a_name_that_is_no_utf8_appears_with_escapes(tmp_path: Path):
+    """Claim: text with bytes that are no UTF-8, as of a folder's name, is written with escapes."""
+    files.replace(tmp_path / "page.md", "run \udcff\n")
+    assert (tmp_path / "page.md").read_bytes() == b"run \\udcff\n"
+
+
 def test_a_log_that_is_a_link_is_refused(tmp_path: Path):
     """Claim: no line is added to what a link in the log's place leads to."""
     victim = tmp_path / "victim"

@@ -180,7 +180,7 @@ def test_only_regular_files_of_a_size_are_read(tmp_path: Path, kind: str):
     else:
         path.touch()
         os.truncate(path, 2**30 + 1)
-    with pytest.raises(PolicyFileError, match="a pipe or a device, or larger than 1024 MiB"):
+    with pytest.raises(PolicyFileError, match="a pipe or a device, or larger than 1048576 KiB"):
         policy_file.load(path)
 
 
