@@ -39,8 +39,8 @@ test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
 
-test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name
-	$(BIN)/python -m tests.faults $(ARGS)
+test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name, SEED=N for others
+	$(BIN)/python -m tests.faults $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .
