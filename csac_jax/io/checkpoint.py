@@ -92,7 +92,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             _publish(draft, folder)
     except Exception as error:  # TensorStore and Orbax raise nearly anything for a full disc
         if cluster.is_first():
-            _clean(root, times=10)
+            _clean(root, looks=10)
         raise CheckpointError(
             f"step {step} could not be saved in {root} ({files.first_line(error)}); earlier "
             "checkpoints are intact; make room there and resume the run"
@@ -218,15 +218,22 @@ def _publish(draft: Path, folder: Path) -> None:
         _remove(folder.parent / str(number))
 
 
-def _clean(root: Path, times: int = 1) -> None:
-    """Removes drafts, `times` times: Orbax's threads may still write, a full disc may refuse."""
+def _clean(root: Path, looks: int = 1) -> None:
+    """Removes drafts until so many looks in a row find none, or for 3 s.
+
+    Orbax's threads may still write, a full disc may refuse.
+    """
     files.remove_drafts(root)
-    for number in range(times):
-        if number:
-            time.sleep(0.05)
-        for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
+    clean = 0
+    for _ in range(60):
+        drafts = [*root.glob("*.orbax-checkpoint-tmp*"), *root.glob(_DRAFT)]
+        for path in drafts:
             with contextlib.suppress(OSError):
                 _remove(path, ignore_errors=True)
+        clean = 0 if drafts else clean + 1
+        if clean == looks:
+            return
+        time.sleep(0.05)
 
 
 def _remove(path: Path, ignore_errors: bool = False) -> None:

@@ -186,13 +186,16 @@ class Run:
     path: Path
     seed: int
     sound: list[int] = dataclasses.field(default_factory=list)  # steps that must be there
-    damaged: set[int] = dataclasses.field(default_factory=set)  # steps that must be refused
+    damaged: set[int] = dataclasses.field(default_factory=set)  # inodes of steps to be refused
     log_whole: bool = True
 
     def saved(self, steps: list[int], killed: bool) -> None:
         """Takes the steps whose save has returned; after a kill an older one may be removed."""
-        self.damaged -= set(steps)
         self.sound = (self.sound + steps)[-1 if killed else -2 :]
+
+    def inode(self, step: int) -> int:
+        """Returns the number of a step's folder, which it keeps where it is moved."""
+        return (self.path / checkpoint.FOLDER / str(step)).stat().st_ino
 
     def judge(self, tally: Tally, about: str) -> None:
         """Counts what is lost or wrong of a run."""
@@ -205,7 +208,8 @@ class Run:
                 return
         step, reference = int(state.step), _reference(self.seed)
         tally.check(step >= max(self.sound, default=0), "lost", f"{about}: step {step} is restored")
-        right = toy.bits(state) == reference.state(step) and step not in self.damaged
+        whole = self.inode(step) not in self.damaged
+        right = toy.bits(state) == reference.state(step) and whole
         right = right and len(extra["grasps"]) == min(toy.E * step, GRASP_WINDOW)
         tally.check(right, "silent", f"{about}: step {step} is restored with other numbers")
         newest = checkpoint.latest_step(self.path) == step
@@ -418,7 +422,7 @@ def corrupt(life: Life) -> None:
     if not runs:
         return
     run, kind = life.pick(runs), life.pick(list(harness.DAMAGES))
-    step = checkpoint.latest_step(run.path)
+    step = checkpoint.latest_step(run.path) or 0
     folder = run.path / checkpoint.FOLDER / str(step)
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stat().st_size]
     if life.rng.random() < 0.2:
@@ -429,7 +433,8 @@ def corrupt(life: Life) -> None:
     harness.damage(life.rng, kind, path)
     if path.name != files.METRICS:
         run.sound = [one for one in run.sound if one != step]
-        run.damaged |= {step} - ({step} if path.name == checkpoint.MANIFEST else set())
+        if path.name != checkpoint.MANIFEST:  # it may say the same in other letters
+            run.damaged.add(run.inode(step))
     run.judge(life.tally, life.about())
 
 

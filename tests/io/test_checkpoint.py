@@ -5,6 +5,7 @@ import dataclasses
 import json
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -190,7 +191,13 @@ def test_what_orbax_left_out_is_no_checkpoint(
 def test_threads_that_write_on_leave_no_draft(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: what Orbax's threads still write after a save has failed is removed too."""
     late = run_dir / "checkpoints" / ".saving.orbax-checkpoint-tmp" / "state"
-    writer = threading.Timer(0.15, late.mkdir, kwargs={"parents": True})
+
+    def write() -> None:
+        for _ in range(3):
+            time.sleep(0.3)
+            late.mkdir(parents=True, exist_ok=True)
+
+    writer = threading.Thread(target=write)
 
     def fail(*_: Any, **__: Any) -> None:
         writer.start()
