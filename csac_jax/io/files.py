@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 import secrets
-import shutil
 import sys
 import time
 import warnings
@@ -147,7 +146,7 @@ def _record(line: bytes) -> dict[str, Any] | None:
         return None
     try:
         record = renamed(parse(line, "line"))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(record, dict):
         return None
@@ -175,7 +174,7 @@ def truncate_log(path: Path, step: int) -> None:
         lines = read_log(path) if path.exists() else []
     for warning in damage:
         copy = path.with_suffix(".damaged.jsonl")
-        shutil.copyfile(path, copy)
+        replace(copy, path.read_bytes())
         warnings.warn(
             f"{warning.message}; the whole file is kept as {copy.name}", DataWarning, stacklevel=2
         )

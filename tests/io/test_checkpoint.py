@@ -130,6 +130,39 @@ def test_links_are_not_followed(run_dir: Path, tmp_path_factory: pytest.TempPath
     assert place.is_symlink() == (name in ("checkpoints", "set-aside"))
 
 
+@pytest.mark.parametrize("name", ["a*", "a?", "[a]", "a\\b", "a\udcff"])
+def test_paths_that_orbax_misreads_are_refused(tmp_path: Path, name: str):
+    """Claim: a path with a sign of a pattern, or that is no UTF-8, is refused in one line."""
+    checkpoint.check_path(tmp_path / "a b")
+    with pytest.raises(CheckpointError, match="no checkpoint can be saved in a path with"):
+        checkpoint.check_path(tmp_path / name)
+
+
+def test_extra_content_comes_back(run_dir: Path):
+    """Claim: what was saved beside the state is read without it."""
+    assert checkpoint.load_extra(run_dir) == {"seconds": 4.0, "grasps": [0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda step: (step / "extra" / "metadata").write_text("{}"), "is no checkpoint of csac"),
+        (lambda step: (step / "state" / "manifest.ocdbt").write_text("x"), "cannot be read"),
+    ],
+)
+def test_sound_files_of_another_program_are_refused(
+    run_dir: Path, damage: Callable[[Path], None], message: str
+):
+    """Claim: files whose digests are right and whose content is another's are one line."""
+    step = run_dir / "checkpoints" / "8"
+    damage(step)
+    files.write_json(step / checkpoint.MANIFEST, {})
+    files.write_json(step / checkpoint.MANIFEST, checkpoint._digests(step))
+    with pytest.raises(CheckpointError, match=message) as caught:
+        checkpoint.restore(run_dir, _abstract(), 8)
+    assert "\n" not in str(caught.value)
+
+
 def test_temporary_folders_are_removed(run_dir: Path):
     """Claim: what a killed save left behind is no step, and the next save removes it."""
     left = run_dir / "checkpoints" / "10.orbax-checkpoint-tmp"

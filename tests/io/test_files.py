@@ -1,14 +1,17 @@
 """Files that appear whole or not at all, and paths that no link leads elsewhere."""
 
 import errno
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from csac_jax.errors import DataWarning
 from csac_jax.io import files, lock
 from csac_jax.io.files import LinkError
+from csac_jax.io.lock import LockedError
 
 
 def _names(folder: Path) -> list[str]:
@@ -78,6 +81,65 @@ def test_drafts_of_killed_processes_are_removed_later(tmp_path: Path):
         os.utime(tmp_path / name, (0, 0), follow_symlinks=False)
     with lock.exclusive(tmp_path):
         assert _names(tmp_path) == sorted([fresh, "a.tmp", lock.LOCK, lock.HOLDER])
+
+
+_LINE = {"step": 1, "actions": 8, "grasps_counted": 2, "seconds": 0.5, "grasp_success": None}
+BAD_LINES = (
+    *("{", "3", "{}", '{"a":' * 700 + "1" + "}" * 700, "[" * 100_000, '"' + "a" * 2**22 + '"'),
+    *(json.dumps(_LINE | {"step": "1"}), json.dumps(_LINE | {"seconds": 10**400})),
+)
+
+
+@pytest.mark.parametrize("bad", BAD_LINES, ids=range(len(BAD_LINES)))
+def test_a_damaged_line_of_a_log_is_counted(tmp_path: Path, bad: str):
+    """Claim: a line that is no record is left out and counted; the whole file is kept beside the
+    log, in the place of a link. A last line that was cut off is no damage; old names are new."""
+    path, copy = tmp_path / "metrics.jsonl", tmp_path / "metrics.damaged.jsonl"
+    copy.symlink_to(tmp_path / "victim")
+    (tmp_path / "victim").write_text("mine")
+    old = json.dumps(_LINE | {"step": 2, "left": 1, "parts": {"own": 3}})
+    text = f"{json.dumps(_LINE)}\n{bad}\n{old}\n{json.dumps(_LINE | {'step': 3})}\n" + '{"ste'
+    path.write_text(text)
+    with pytest.warns(DataWarning, match="1 of 4 lines are damaged and left out; the whole file"):
+        files.truncate_log(path, 2)
+    first, second = files.read_log(path)
+    assert first == _LINE
+    assert (second["blocks_lost"], second["parts"]) == (1, {"in_distribution": 3})
+    assert copy.read_text() == text
+    assert (tmp_path / "victim").read_text() == "mine"
+    files.truncate_log(path, 0)
+    assert path.read_text() == ""
+
+
+def test_json_that_is_no_object_is_named(tmp_path: Path):
+    """Claim: other JSON, deep nesting and a pipe are one line with the file's name."""
+    for text, message in (("[]", "holds no JSON object"), ("[" * 10**5, "is not readable JSON")):
+        (tmp_path / "a.json").write_text(text)
+        with pytest.raises(ValueError, match=rf"a\.json {message}"):
+            files.read_object(tmp_path / "a.json")
+    files.write_json(tmp_path / "a.json", {"b": 1})
+    assert files.read_object(tmp_path / "a.json") == {"b": 1}
+
+
+def test_the_first_line_of_an_error():
+    """Claim: of a long message the first line is shown, of the system's errors their text."""
+    assert files.first_line(OSError(errno.ENOSPC, "No space left", "a")) == "No space left"
+    assert files.first_line(ValueError("one\ntwo")) == "one"
+    assert files.first_line(KeyError()) == "KeyError"
+
+
+def test_a_folder_is_written_by_one_process(tmp_path: Path):
+    """Claim: a second holder is refused with the first one's name; one that another host did not
+    release is warned of; after the end nobody holds it."""
+    with lock.exclusive(tmp_path):
+        with pytest.raises(LockedError, match=rf"in use by process {os.getpid()} on"):
+            lock.exclusive(tmp_path).__enter__()
+        (tmp_path / lock.HOLDER).write_bytes(b"\xff")
+        with pytest.raises(LockedError, match="in use by a process"):
+            lock.exclusive(tmp_path).__enter__()
+    (tmp_path / lock.HOLDER).write_text("process 1 on another host")
+    with pytest.warns(DataWarning, match="by process 1 on another host and not released"):
+        lock.exclusive(tmp_path).__enter__()
 
 
 def test_a_folder_may_be_a_link_but_none_below_it(tmp_path: Path):

@@ -184,6 +184,17 @@ def test_only_regular_files_of_a_size_are_read(tmp_path: Path, kind: str):
         policy_file.load(path)
 
 
+def test_damage_is_seen(tmp_path: Path, params: Params):
+    """Claim: a number that has changed is refused by the digest."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileError, match="is damaged: its digest differs"):
+        policy_file.load(path)
+
+
 def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch):
     """Claim: a shipped policy that was replaced, by a sound file even, is refused."""
     path = tmp_path / "clear.safetensors"
