@@ -11,6 +11,14 @@ from tests.faults import harness
 FAULTS = harness.load()
 
 
+def test_the_page_is_short_and_its_table_whole():
+    """Claim: docs/reliability.md has at most 1,200 words besides its whole table."""
+    page = (harness.ROOT / "docs/reliability.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("|")]
+    assert [row.split(" | ")[0].strip("| ") for row in rows[2:]] == list(FAULTS)
+    assert len(page.split()) - sum(len(row.split()) for row in rows) <= 1200
+
+
 def test_a_seed_draws_other_faults(tmp_path: Path):
     """Claim: without a seed the faults are those of every other call; a seed draws others, which it
     draws again."""
