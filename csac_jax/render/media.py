@@ -1,5 +1,7 @@
 """Pictures and videos as files; the suffix names the format."""
 
+import contextlib
+import errno
 import io
 import warnings
 from collections.abc import Iterable
@@ -50,7 +52,21 @@ def write_video(path: Path, pictures: Iterable[np.ndarray]) -> None:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     settings = {"fps": FRAMES_PER_SECOND, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    number = 0
     with imageio.get_writer(path, **settings) as writer, warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*fork", RuntimeWarning)  # ffmpeg replaces the fork
         for picture in pictures:
             writer.append_data(picture)
+            number += 1
+    _check_whole(path, number)
+
+
+def _check_whole(path: Path, number: int) -> None:
+    """Raises OSError unless a film has so many pictures: ffmpeg is silent about a full disc."""
+    import imageio_ffmpeg
+
+    with contextlib.suppress(RuntimeError):  # of a file that is cut off
+        if imageio_ffmpeg.count_frames_and_secs(str(path))[0] == number:
+            return
+    path.unlink(missing_ok=True)
+    raise OSError(errno.EIO, "ffmpeg could not write it whole; is the disc full?", str(path))
