@@ -1,4 +1,4 @@
-# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, JOBS, VIEWED may be set.
+# Everything runs in .venv; the first target that needs it makes it. PYTHON, PRESET, ARGS, RUN, POLICY, EPISODES, JOBS, SEED, SECONDS, VIEWED may be set.
 PYTHON ?= python3
 PRESET ?= quick
 POLICY ?= learned
@@ -14,7 +14,7 @@ STAMP := $(VENV)/.installed
 # Options of the pinned XLA.
 COMPILE_LITTLE := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true --xla_disable_hlo_passes=while-loop-invariant-code-motion
 
-.PHONY: help setup train eval test test-slow test-faults lint format bench pictures figures docs dist doctor clean
+.PHONY: help setup train eval test test-slow test-faults lives lint format bench pictures figures docs dist doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -39,8 +39,11 @@ test: $(STAMP)  ## fast tests, in JOBS (2) processes; they compile much and run 
 test-slow: $(STAMP)  ## slow tests
 	$(BIN)/python -m pytest -m slow -n $(JOBS) --dist loadfile $(ARGS)
 
-test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name
-	$(BIN)/python -m tests.faults $(ARGS)
+test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name, SEED=N for others
+	$(BIN)/python -m tests.faults $(if $(SEED),--seed $(SEED)) $(ARGS)
+
+lives: $(STAMP)  ## live whole lives of runs, sweeps and policies for SECONDS (60); SEED=N for others
+	$(BIN)/python -m tests.faults.lives --seconds $(or $(SECONDS),60) --jobs $(JOBS) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy
 	$(BIN)/ruff check .

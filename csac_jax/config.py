@@ -18,6 +18,7 @@ PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
 Pair = tuple[float, float]
+MOST_CELLS = 2**24  # of all rotated maps (ours: 20 times the paper's)
 TRAY_WALL: Pair = (0.01, 0.05)  # m, thickness and height of a tray's walls (ours)
 
 
@@ -32,7 +33,7 @@ class SceneConfig(Section, section="scene"):
     split: Literal["train", "held_out", "all"] = "train"
     """Objects of the library: those for training, those kept for evaluation, or all (for eval)."""
     min_blocks: int = number(5, 1)  # Fewest blocks in play in a scene; the most is one per slot.
-    pool: int = number(1024, 1)  # Pre-settled scenes to sample episodes from, per block count.
+    pool: int = number(1024, 1, 2**20)  # Settled scenes to sample episodes from, per block count.
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
     certified: tuple[Literal["blocked", "enclosed", "tray", "hidden"], ...] = ()
     """Suites whose scenes for training are the pool, in place of dropped and packed ones."""
@@ -110,9 +111,13 @@ class SimConfig(Section, section="sim"):
     """Friction of the pads, drawn by episode; 0: the gripper's (for own grippers)."""
     grip_force: Pair = number((0.0, 0.0), 0.0, 200.0)
     """Force of the grip, N, drawn by episode; 0: the gripper's (for own grippers)."""
-    grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1)  # Substeps: descend, close, lift.
-    geom_pairs: int = number(12, 1)  # Geom pairs examined per collision function, nearest first.
-    contacts: int = number(48, 1)  # Contacts that MJX and Warp keep per step.
+    grasp_phases: tuple[int, int, int] = number(
+        (60, 50, 80), 1, 10**5
+    )  # Substeps: down, close, lift.
+    geom_pairs: int = number(
+        12, 1, 4096
+    )  # Geom pairs examined per collision function, the nearest.
+    contacts: int = number(48, 1, 2**16)  # Contacts that MJX and Warp keep per step.
 
     def check(self) -> None:
         for name in ("pad_friction", "grip_force"):
@@ -195,7 +200,7 @@ class SensorConfig(Section, section="sensor"):
 class HeightmapConfig(Section, section="heightmap"):
     """The top view: rows along y, columns along x, row 0 and column 0 at the lowest y and x."""
 
-    size: int = number(64, 16)  # H = W, cells.
+    size: int = number(64, 16, 1024)  # H = W, cells.
     extent: float = number(0.448, 0.1, 1.0)  # Side of the workspace, m (VPG; for own tables).
     view: Literal["ortho", "oblique"] = "ortho"
     """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras)."""
@@ -215,9 +220,9 @@ class _AnyNet(Section, section="net"):
     dtype: ClassVar[str] = "auto"  # bfloat16 on accelerators, else float32, as are parameters
     pad_fraction: ClassVar[float]  # rotated maps are about this fraction larger than the workspace
     canvas_step: ClassVar[int]  # their sides are multiples of it: whole cells of the features
-    rotations: int = number(16, 4)  # K, yaws of the dense map over a full turn (CSAC sec. 3.2).
+    rotations: int = number(16, 4, 360)  # K, yaws of the dense map over a turn (CSAC sec. 3.2).
     colour: bool = True  # See colours, not heights alone (for an ablation).
-    head: int = number(32, 4)  # Channels of the 1 x 1 convolution before each head (VPG 64).
+    head: int = number(32, 4, 4096)  # Channels of the 1 x 1 convolution before each head (VPG 64).
 
     def canvas(self, size: int) -> int:
         """Returns the cells along a side of the rotated maps of a height map of `size` cells."""
@@ -231,9 +236,9 @@ class SmallNet(_AnyNet):
     canvas_step: ClassVar[int] = 4  # whole cells at either stride
     kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     gripper: bool = False  # See the gripper's opening and the size of its fingers.
-    growth: int = number(24, 4)  # Channels that each dense layer adds.
+    growth: int = number(24, 4, 1024)  # Channels that each dense layer adds.
     dilations: tuple[int, ...] = number((1, 2, 4, 1), 1, 64)  # Dilation of each dense layer, 3 x 3.
-    stem: int = number(16, 4)  # Channels of the first convolution.
+    stem: int = number(16, 4, 4096)  # Channels of the first convolution.
     stride: Literal[2, 4] = 2  # Input cells per feature cell, each axis; 4: a quarter of the work.
     subpixel: Literal[1, 2, 4] = 1  # Map cells per feature cell, along each axis; at most `stride`.
 
@@ -267,9 +272,9 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-    candidates: int = number(64, 1)  # J, actions sampled in a round.
+    candidates: int = number(64, 1, 2**16)  # J, actions sampled in a round.
     elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
-    rounds: int = number(3, 1)  # Rounds of sampling and fitting.
+    rounds: int = number(3, 1, 1000)  # Rounds of sampling and fitting.
     start: Literal["both", "actor", "cells"] = "both"
     """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
 
@@ -364,8 +369,8 @@ class LearnConfig(Section, section="learn"):
     actor_learning_rate: float = number(3e-4, 0.0, above=True)  # Adam's step size, actor (ours).
     lr_final_fraction: float = number(0.05, 0.0, 1.0, above=True)
     """Both step sizes fall linearly to this share of themselves over the run (ours)."""
-    batch: int = number(32, 1)  # B, transitions per update (N of Algorithm 1).
-    updates_per_step: int = number(2, 1)  # Critic updates per step of all scenes; one of the actor.
+    batch: int = number(32, 1, 2**16)  # B, transitions per update (N of Algorithm 1).
+    updates_per_step: int = number(2, 1, 2**16)  # Critic updates per step of all scenes.
     actor_batch: int = number(0, 0)  # Part of the last batch that the actor learns on; 0: all.
     augment: bool = True  # Show each drawn transition under a random symmetry of the square.
     augment_shift: int = number(0, 0, 64)  # Largest shift of a drawn transition, cells.
@@ -425,10 +430,10 @@ ALTERNATIVES["replay"] = ("sampler", get_args(ReplayConfig))
 class TrainConfig(Section, section="train"):
     """Length and shape of a run."""
 
-    scenes: int = number(8, 1)  # E, parallel scenes; each takes one action per training step.
+    scenes: int = number(8, 1, 2**16)  # E, parallel scenes; each takes an action per training step.
     actions: int = number(2000, 1)  # Actions of the whole run over all scenes.
     learning_starts: int = number(64, 1)  # Actions before the first update.
-    chunk: int = number(10, 1)  # Training steps per compiled call; the host logs between calls.
+    chunk: int = number(10, 1, 2**20)  # Training steps per compiled call; logs come between calls.
     save_every: int = number(50, 1)  # Chunks per checkpoint; the last and a stop always save.
 
     @property
@@ -486,6 +491,8 @@ class Config(Section):
         most = 2 * math.floor(0.5 * math.pi * size)
         fits = rotations % 2 == 0 and rotations <= most
         require(fits, f"net.rotations: must be even, at most {most} for heightmap.size {size}")
+        fits = size**2 * rotations <= MOST_CELLS
+        require(fits, f"heightmap.size: its square times net.rotations is above {MOST_CELLS}")
         self._check_tray()
         fits = not self.scene.has_objects or self.sim.physics != "mjx"
         require(fits, "sim.physics: objects that differ between scenes need c, warp or auto")

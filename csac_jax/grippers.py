@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
+from csac_jax import reading
 from csac_jax.assets import assets
 from csac_jax.errors import SettingsError, first_fault
 
@@ -191,10 +192,10 @@ def _from_folder(folder: Path) -> Gripper:
     if not path.is_file():
         neither = f"sim.gripper: '{folder}' is neither one of {', '.join(shipped())}"
         raise SettingsError(f"{neither} nor a folder with a {NUMBERS}")
-    if path.stat().st_size > LARGEST:
-        raise SettingsError(f"{path}: is larger than 1 MiB")
     try:
-        return _from_json(folder, path.read_bytes())
+        return _from_json(folder, reading.read_bytes(path, LARGEST))
+    except OSError as error:
+        raise SettingsError(f"{path}: {error.strerror}") from None
     except ValueError as error:
         raise SettingsError(f"{path}: {error}") from None
 

@@ -100,6 +100,9 @@ def test_values_out_of_range(name: str, values: list):
         ({"camera.size": (8192, 480)}, "camera.size: must be at most 4096"),
         ({"sensor.pose_noise": (0.01, 0.0)}, "sensor.pose_noise: must be 0"),
         ({"net.subpixel": 4, "net.stride": 2}, "net.subpixel: at most net.stride"),
+        ({"heightmap.size": 2**31}, "heightmap.size: must be at most 1024"),
+        ({"heightmap.size": 1024, "net.rotations": 32}, "heightmap.size: its square times net"),
+        ({"net.growth": 10**9}, "net.growth: must be at most 1024"),
         ({"learn.actor_batch": 33}, "learn.actor_batch: must not exceed learn.batch"),
         ({"policy.primitive": "grasp"}, "explore.push_fraction: must be 0"),
         (

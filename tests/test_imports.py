@@ -43,7 +43,7 @@ ORDER = (
     ("config",),
     ("section",),
     ("grippers",),
-    ("constants", "errors", "cache_folder", "assets"),
+    ("constants", "errors", "cache_folder", "assets", "reading"),
     ("__init__",),
     ("_guard", "_version"),
 )

@@ -1,6 +1,7 @@
 """Output of commands: lines that a closed pipe cannot stop, JSON with its provenance."""
 
 import contextlib
+import io
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -50,6 +51,9 @@ def unbroken() -> Iterator[None]:
     """Lets the work in the block continue if stdout or stderr is closed."""
     sys.stdout, sys.stderr = sys.stdout or _null_stream(1), sys.stderr or _null_stream(2)
     before = sys.stdout, sys.stderr
+    for stream in before:
+        if isinstance(stream, io.TextIOWrapper):  # what it cannot encode appears with escapes
+            stream.reconfigure(errors="backslashreplace")
     sys.stdout, sys.stderr = map(BrokenPipeGuard, before)
     try:
         yield

@@ -4,7 +4,9 @@ import argparse
 import contextlib
 import dataclasses
 import difflib
+import os
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
@@ -12,6 +14,7 @@ import tyro
 from csac_jax.config import SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
+from csac_jax.section import require
 
 try:
     from tyro._errors import on_parse_error
@@ -20,6 +23,7 @@ except ImportError:  # another version: it prints the error in a box and exits w
 
 PROGRAM = "csac-jax"
 Kind = TypeVar("Kind")
+_OUTPUTS = ("json", "markdown", "png", "video")  # options that name a file to write
 SHORT_HELP = {"-h", "--help"}
 
 
@@ -43,7 +47,19 @@ def parse(
 
     args = ["--help"] if asks_help(arguments) else list(arguments)
     with on_parse_error(refuse), _registry():
-        return tyro.cli(kind, prog=prog, args=args, default=default, description=description)
+        parsed = tyro.cli(kind, prog=prog, args=args, default=default, description=description)
+    _check_outputs(vars(parsed))
+    return parsed
+
+
+def _check_outputs(options: dict[str, Any]) -> None:
+    """Raises SettingsError for a file to write that cannot be written."""
+    for name in _OUTPUTS:
+        if isinstance(path := options.get(name), Path):
+            require(not path.is_dir(), f"--{name}: {path} is a folder; give the name of a file")
+            above = next(folder for folder in path.absolute().parents if folder.exists())
+            writable = above.is_dir() and os.access(above, os.W_OK)
+            require(writable, f"--{name}: {above} is no folder that you may write; give another")
 
 
 def _message(event: Any, kind: Any) -> str | None:

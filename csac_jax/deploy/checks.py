@@ -96,7 +96,7 @@ def _sees_centre(view: CameraView, pose: np.ndarray) -> bool:
 def depth_unit(view: CameraView, extent: float) -> None:
     """Checks that depth is in metres: near to a table's by the pose."""
     ratio = _depth_ratio(view, extent)
-    power = round(np.log10(ratio))
+    power = round(min(np.log10(ratio), 99.0))  # it may be infinite
     if 1 <= abs(power) <= 3 and abs(np.log10(ratio) - power) < 0.15:
         raise ViewError(
             f"depth is {ratio:.3g} times what camera_pose says: it seems to be "

@@ -67,10 +67,12 @@ class Monitor(Callback):
 
     def begin(self, run: RunInfo) -> None:
         """Restores the log and the best state of a run that is resumed."""
-        self._run_dir, self._done = run.run_dir, run.step * self._cfg.train.scenes
+        self._done = run.step * self._cfg.train.scenes
+        self._log_path = files.inside(run.run_dir, files.EVALUATIONS)
+        self._best_dir = files.inside(run.run_dir, files.BEST)
         files.write_json(run.run_dir / PLAN, self._plan._asdict())
-        files.truncate_log(run.run_dir / files.EVALUATIONS, run.step)
-        self._best = _best_score(run.run_dir / files.BEST, run.step)
+        files.truncate_log(self._log_path, run.step)
+        self._best = _best_score(self._best_dir, run.step)
 
     def chunk(self, record: Record, state: Any) -> None:
         """Evaluates after every so many actions, and after the last chunk."""
@@ -86,7 +88,7 @@ class Monitor(Callback):
         if best := score > self._best:
             self._best = score
             extra = {"seconds": record.seconds, "grasps": [], "score": score}
-            checkpoint.save(self._run_dir / files.BEST, record.step, state, self._cfg, extra)
+            checkpoint.save(self._best_dir, record.step, state, self._cfg, extra)
         self._write(record, round(time.time() - begun, 3), score, best, table)
         values = [f"{name} {value:.1%}" for name, value in zip(JUDGED, score, strict=True)]
         line = f"evaluated on {self._plan.suite} at {record.actions} actions: {', '.join(values)}"
@@ -108,8 +110,7 @@ class Monitor(Callback):
             "suite": self._plan.suite,
             "table": table,
         }
-        with (self._run_dir / files.EVALUATIONS).open("a") as log:
-            log.write(json.dumps(line) + "\n")
+        files.append(self._log_path, json.dumps(line))
 
 
 def _best_score(folder: Path, step: int) -> Score:

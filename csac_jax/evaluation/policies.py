@@ -22,7 +22,7 @@ from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import modules, short
 from csac_jax.section import require
-from csac_jax.training import own_parts, programs
+from csac_jax.training import memory, own_parts, programs
 from csac_jax.vision import heightmap
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import scene_state
@@ -258,7 +258,12 @@ def load(
     folder, step = _checkpoint(path, which)
     cfg = checkpoint.load_config(folder, step)
     own_parts.check_loadable(folder, cfg, own_parts.OwnParts(network=network, learner=learner))
-    state, _ = checkpoint.restore(folder, programs.abstract_state(cfg, learner, network), step)
+    shapes = programs.abstract_state(cfg, learner, network)
+    needed, room = memory.tree_bytes(shapes) / memory.GIB, memory.limit() / memory.GIB
+    if needed > room:
+        fault = f"its state takes {needed:.1f} GiB, there are {room:.1f}"
+        raise checkpoint.CheckpointError(f"{folder}: {fault}; use a machine with more memory")
+    state, _ = checkpoint.restore(folder, shapes, step)
     if learner is None:
         policy_file.check_finite(folder, state.learner.online)
     return policy_from_state(cfg, state.learner, network, learner)
@@ -276,7 +281,7 @@ def policy_from_state(
 def _checkpoint(run_dir: Path, which: Which) -> tuple[Path, int | None]:
     if which != "best":
         return run_dir, None if which == "last" else int(which)
-    if not (best := run_dir / files.BEST).exists():
+    if not (best := files.inside(run_dir, files.BEST)).exists():
         raise FileNotFoundError(f"there is no {best}; a run keeps its best with eval_every")
     return best, None
 

@@ -19,6 +19,7 @@ import itertools
 import json
 import logging
 import math
+import os
 import re
 import secrets
 import shutil
@@ -91,7 +92,7 @@ def save(run_dir: Path, step: int, state: Any, cfg: Config, extra: dict[str, Any
             _publish(draft, folder)
     except Exception as error:  # TensorStore and Orbax raise nearly anything for a full disc
         if cluster.is_first():
-            _clean(root, times=10)
+            _clean(root, looks=10)
         raise CheckpointError(
             f"step {step} could not be saved in {root} ({files.first_line(error)}); earlier "
             "checkpoints are intact; make room there and resume the run"
@@ -196,8 +197,13 @@ def latest_step(run_dir: Path) -> int | None:
     return max(_steps(run_dir), default=None)
 
 
+def remove(run_dir: Path) -> None:
+    """Removes all checkpoints of a run."""
+    shutil.rmtree(_root(run_dir), ignore_errors=True)
+
+
 def _set_aside(folder: Path) -> None:
-    place = folder.parent / SET_ASIDE
+    place = files.inside(folder.parent, SET_ASIDE)
     place.mkdir(exist_ok=True)
     names = itertools.chain([folder.name], (f"{folder.name}-{i}" for i in itertools.count(2)))
     folder.rename(next(place / name for name in names if not (place / name).exists()))
@@ -209,16 +215,33 @@ def _publish(draft: Path, folder: Path) -> None:
     draft.rename(folder)
     files.sync_folder(folder.parent)
     for number in _steps(folder.parents[1])[:-KEPT]:
-        shutil.rmtree(folder.parent / str(number))
+        _remove(folder.parent / str(number))
 
 
-def _clean(root: Path, times: int = 1) -> None:
-    """Removes drafts, `times` times: Orbax's threads may still write, a full disc may refuse."""
-    for number in range(times):
-        if number:
-            time.sleep(0.05)
-        for path in [*root.glob("*.orbax-checkpoint-tmp*"), root / _DRAFT]:
-            shutil.rmtree(path, ignore_errors=True)
+def _clean(root: Path, looks: int = 1) -> None:
+    """Removes drafts until so many looks in a row find none, or for 3 s.
+
+    Orbax's threads may still write, a full disc may refuse.
+    """
+    files.remove_drafts(root)
+    clean = 0
+    for _ in range(60):
+        drafts = [*root.glob("*.orbax-checkpoint-tmp*"), *root.glob(_DRAFT)]
+        for path in drafts:
+            with contextlib.suppress(OSError):
+                _remove(path, ignore_errors=True)
+        clean = 0 if drafts else clean + 1
+        if clean == looks:
+            return
+        time.sleep(0.05)
+
+
+def _remove(path: Path, ignore_errors: bool = False) -> None:
+    """Removes a folder, or a file or link in its place."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors)
+    else:
+        path.unlink()
 
 
 def _name_run(root: Path) -> str:
@@ -240,7 +263,7 @@ def _run_name(root: Path) -> str | None:
 
 
 def _root(run_dir: Path) -> Path:
-    return Path(run_dir).resolve() / FOLDER
+    return Path(os.path.realpath(files.inside(Path(run_dir), FOLDER)))
 
 
 @contextlib.contextmanager
@@ -327,6 +350,8 @@ def _sha256(path: Path) -> str:
 
 
 def _fault(folder: Path) -> str | None:
+    if folder.is_symlink():
+        return "is a link"
     try:
         wanted = files.read_object(folder / MANIFEST)
         actual = _digests(folder)

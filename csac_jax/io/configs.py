@@ -18,11 +18,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from csac_jax import algorithms, grippers, presets
+from csac_jax import algorithms, grippers, presets, reading
 from csac_jax.config import Config, SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
-from csac_jax.io import files, renames
+from csac_jax.io import renames
 from csac_jax.section import (
     ALTERNATIVES,
     Section,
@@ -34,6 +34,9 @@ from csac_jax.section import (
 )
 
 FORMAT = 2
+_LARGEST = 2**17  # bytes of a config file
+_LONGEST_LINE = 2**12  # bytes in TOML, whose parser takes the square of a key's parts
+_MOST_BRACKETS = 1000  # in YAML, whose scanner takes the square of their number
 
 
 def to_dict(cfg: Config) -> dict[str, Any]:
@@ -179,7 +182,7 @@ def _read(path: Path) -> dict[str, Any]:
     if path.suffix not in READERS:
         raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
     kind, parse = READERS[path.suffix]
-    text = files.read_bytes(path).decode()
+    text = reading.read_bytes(path, _LARGEST).decode()
     try:
         content = json.loads(json.dumps(parse(text), default=str))
     except RecursionError:
@@ -191,10 +194,18 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
+def _toml(text: str) -> Any:
+    longest = max(map(len, text.splitlines()), default=0)
+    require(longest <= _LONGEST_LINE, f"has a line of {longest} characters; break it")
+    return tomllib.loads(text)
+
+
 def _yaml(text: str) -> Any:
     """Reads plain values. Refuses aliases: a short file could stand for an endless one."""
     import yaml
 
+    brackets = text.count("[") + text.count("{")
+    require(brackets <= _MOST_BRACKETS, f"has {brackets} brackets, more than {_MOST_BRACKETS}")
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise SettingsError("aliases (*name) are not read; write the values out")
@@ -204,7 +215,7 @@ def _yaml(text: str) -> Any:
 
 
 READERS: dict[str, tuple[str, Callable[[str], Any]]] = {
-    ".toml": ("TOML", tomllib.loads),
+    ".toml": ("TOML", _toml),
     ".yaml": ("YAML", _yaml),
     ".yml": ("YAML", _yaml),
     ".json": ("JSON", json.loads),

@@ -7,18 +7,18 @@ RUN/best/, RUN/evaluations.jsonl    see `evaluation.monitor`
 """
 
 import contextlib
-import errno
 import json
 import os
-import shutil
-import stat
+import secrets
 import sys
+import time
 import warnings
 from pathlib import Path
 from typing import Any
 
-from csac_jax.errors import DataWarning
+from csac_jax.errors import DataWarning, FailedError
 from csac_jax.io import renames
+from csac_jax.reading import read_bytes
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
@@ -26,23 +26,69 @@ RECORD = "train.json"  # device, versions and commit: in the folder of a run, or
 EVALUATIONS = "evaluations.jsonl"
 SWEEP_PLAN = "sweep.json"
 BEST = "best"
-LARGEST = 2**30  # bytes of a file that is read at once
+LARGEST_JSON = 2**27  # bytes of a file of one JSON value, whose objects take ten times as much
+_LONGEST_LINE = 2**22  # bytes of a line of a log
+STALE = 3600.0  # s without a change, after which a draft is that of a killed process
+_DRAFT = ".csac-jax-{}.tmp"  # of a random number: two processes never share a draft
+
+
+class LinkError(FailedError):
+    """A path of a run or sweep that is a link."""
+
+
+def inside(folder: Path, *names: str | Path) -> Path:
+    """Returns a path below the folder of a run or sweep, which itself may be a link.
+
+    Raises LinkError if there is a link below the folder.
+    """
+    path = folder
+    for part in Path(*names).parts:
+        path = path / part
+        if part == ".." or path.is_symlink():
+            raise LinkError(f"{path} is a link; put a folder or file of the run in its place")
+    return path
 
 
 def replace(path: Path, content: str | bytes) -> None:
-    """Writes a file at once, or raises OSError and leaves nothing. Creates its folder."""
+    """Writes a file at once, or raises OSError and leaves nothing. Creates its folder.
+
+    A link in its place is replaced and its target stays.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
+    draft = path.with_name(_DRAFT.format(secrets.token_hex(8)))
     try:
-        with temporary.open("wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
+        with draft.open("xb") as file:  # x follows no link
+            file.write(_encoded(content))
             file.flush()
             os.fsync(file.fileno())  # else a power failure may leave it empty
-        temporary.replace(path)
+        draft.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+            draft.unlink(missing_ok=True)
         raise
+
+
+def _encoded(content: str | bytes) -> bytes:
+    """Encodes text; a name that is no UTF-8 appears with escapes."""
+    return content.encode(errors="backslashreplace") if isinstance(content, str) else content
+
+
+def append(path: Path, line: str) -> None:
+    """Adds a line to a log. Raises OSError where the log is a link."""
+
+    def opener(name: str, flags: int) -> int:
+        return os.open(name, flags | os.O_NOFOLLOW, 0o666)
+
+    with open(path, "a", opener=opener) as log:
+        log.write(f"{line}\n")
+
+
+def remove_drafts(folder: Path) -> None:
+    """Removes drafts that killed processes left in a folder, once they are STALE."""
+    for draft in folder.glob(_DRAFT.format("*")):
+        with contextlib.suppress(OSError):
+            if time.time() - draft.lstat().st_mtime > STALE:
+                draft.unlink()
 
 
 def sync_folder(folder: Path) -> None:
@@ -61,7 +107,7 @@ def write_json(path: Path, content: Any) -> None:
 
 def read_object(path: Path) -> dict[str, Any]:
     """Returns the JSON object of a file. Raises ValueError for other content, OSError."""
-    content = parse(read_bytes(path), path.name)
+    content = parse(read_bytes(path, LARGEST_JSON), path.name)
     if not isinstance(content, dict):
         raise ValueError(f"{path.name} holds no JSON object")
     return content
@@ -73,18 +119,6 @@ def parse(text: str | bytes, name: str) -> Any:
         return json.loads(text)
     except (ValueError, RecursionError):
         raise ValueError(f"{name} is not readable JSON") from None
-
-
-def read_bytes(path: Path) -> bytes:
-    """Returns the content of a regular file.
-
-    Raises OSError for a pipe or device, which may never end, and for more than LARGEST.
-    """
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST:
-        reason = "is a folder, a pipe or a device, or larger than 1 GiB"
-        raise OSError(errno.EINVAL, reason, str(path))
-    return path.read_bytes()
 
 
 def first_line(error: BaseException) -> str:
@@ -109,9 +143,11 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 def _record(line: bytes) -> dict[str, Any] | None:
     """Returns a line of a log, None if it is damaged or lacks a required number."""
+    if len(line) > _LONGEST_LINE:
+        return None
     try:
         record = renamed(parse(line, "line"))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(record, dict):
         return None
@@ -139,7 +175,7 @@ def truncate_log(path: Path, step: int) -> None:
         lines = read_log(path) if path.exists() else []
     for warning in damage:
         copy = path.with_suffix(".damaged.jsonl")
-        shutil.copyfile(path, copy)
+        replace(copy, path.read_bytes())
         warnings.warn(
             f"{warning.message}; the whole file is kept as {copy.name}", DataWarning, stacklevel=2
         )

@@ -27,7 +27,7 @@ def exclusive(folder: Path) -> Iterator[None]:
     Raises LockedError if another process holds it. Warns if the last holder, on another host, did
     not release it: some shared folders have no locks between hosts.
     """
-    lock, holder = filelock.FileLock(folder / LOCK), folder / HOLDER
+    lock, holder = filelock.FileLock(files.inside(folder, LOCK)), folder / HOLDER
     try:
         lock.acquire(timeout=0)
     except filelock.Timeout:
@@ -38,6 +38,7 @@ def exclusive(folder: Path) -> Iterator[None]:
         text = f"{folder} was in use by {last} and not released; check that it does not run"
         warnings.warn(text, DataWarning, stacklevel=3)
     try:
+        files.remove_drafts(folder)
         files.replace(holder, f"process {os.getpid()} on {host}")
         yield
     finally:

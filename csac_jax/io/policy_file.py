@@ -15,7 +15,7 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from csac_jax import grippers
+from csac_jax import grippers, reading
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
@@ -50,6 +50,7 @@ def save(path: Path, params: Params, cfg: Config) -> None:
     stored = configs.to_dict(cfg.change(sim={"gripper": gripper}))
     remarks = {_CONFIG: json.dumps(stored), _VERSIONS: json.dumps(provenance.versions())}
     remarks[_DIGEST] = _digest(remarks, tensors)
+    files.remove_drafts(path.parent)
     files.replace(path, safetensors.numpy.save(tensors, remarks))
 
 
@@ -111,6 +112,7 @@ def load(path: Path) -> tuple[Config, Params]:
 
 def _content(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     try:
+        reading.check_regular(path)
         with safetensors.safe_open(path, "numpy") as file:
             remarks = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118, it is no dict

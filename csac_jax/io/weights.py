@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
+from csac_jax import reading
 from csac_jax.config import DenseNet121
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
@@ -27,6 +28,7 @@ def read(cfg: DenseNet121, path: Path) -> Any:
     Raises SettingsError, one line that names a missing, extra or misshapen tensor.
     """
     try:
+        reading.check_regular(path)
         tensors = safetensors.numpy.load_file(path)
     except Exception as error:  # KeyError for a type that NumPy lacks, others for a damaged header
         raise SettingsError(

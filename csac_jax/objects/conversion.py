@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac_jax import reading
 from csac_jax.objects import body, descriptions, solid
 from csac_jax.objects.body import DENSITY, Object
 
@@ -35,8 +36,6 @@ def convert(path: Path, name: str, settings: ImportSettings) -> tuple[Object, fl
     """
     import trimesh
 
-    if path.stat().st_size > MOST_BYTES:
-        raise ValueError(f"is larger than {MOST_BYTES >> 20} MiB; reduce its mesh")
     content, mesh = read(path)
     shapes = _shapes(_scaled(mesh, settings.scale))
     whole = trimesh.boolean.union(shapes) if len(shapes) > 1 else shapes[0]
@@ -62,7 +61,7 @@ def share(one: Object) -> float:
 
 def read(path: Path) -> tuple[bytes, Any]:
     """Reads a file: its content, with corners that are in other files, and its mesh of trimesh."""
-    content, kind = path.read_bytes(), path.suffix.lower()
+    content, kind = reading.read_bytes(path, MOST_BYTES), path.suffix.lower()
     described = kind in descriptions.SUFFIXES
     mesh = descriptions.read(path) if described else _read_mesh(content, kind[1:])
     if not 4 <= len(getattr(mesh, "faces", ())) <= MOST_TRIANGLES:

@@ -3,15 +3,24 @@
 It must be one rigid body: no joints but a free one.
 """
 
+import html
+import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
+from csac_jax import reading
+
 SUFFIXES = (".urdf", ".xml")
 _LARGEST = 2**22  # bytes of a description
+_LARGEST_NAMED = 2**26  # bytes of a file that it names
+_MOST_NAMES = 1000  # of files in all descriptions of an object
+_FILE = re.compile(rb"""\bfile\w*\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_FOLDER = re.compile(rb"""\b(?:mesh|texture|asset)dir\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _FREE = 6  # degrees of freedom of the whole
 _Geom = mujoco.mjtGeom
 
@@ -23,9 +32,10 @@ def read(path: Path) -> Any:
     """
     if path.stat().st_size > _LARGEST:
         raise ValueError(f"is larger than {_LARGEST >> 20} MiB; keep its meshes in files")
+    _check_named(path)
     try:
         spec = mujoco.MjSpec.from_file(str(path))
-        spec.assets = _whole_files(spec, path.parent.resolve())
+        spec.assets = _whole_files(spec, path.parent)
         model = spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         raise ValueError(" ".join(str(error).split())[:200]) from None
@@ -56,12 +66,44 @@ def _whole_files(spec: mujoco.MjSpec, folder: Path) -> dict[str, bytes]:
     """Returns the OBJ files that a description names, each as one shape."""
     whole = {}
     for mesh in spec.meshes:
-        file = (folder / spec.meshdir / mesh.file).resolve()
-        if mesh.file and not file.is_relative_to(folder):
-            raise ValueError(f"names '{mesh.file}', outside of its folder; move it there")
+        file = folder / spec.meshdir / mesh.file
         if file.suffix.lower() == ".obj" and file.is_file():
             whole[mesh.file] = one_shape(file.read_bytes())
     return whole
+
+
+def _check_named(path: Path) -> None:
+    """Raises ValueError if a file that MuJoCo may open for a description is not a regular one below
+    its folder: all that look like names count, in the files named as well."""
+    root, left, read = os.path.realpath(path.parent), {os.path.realpath(path)}, set[str]()
+    names, folders = set[str](), {root}
+    while left:
+        for file in left:
+            content = reading.read_bytes(Path(file), _LARGEST_NAMED)
+            names |= _texts(_FILE, content)
+            folders |= {os.path.dirname(file), *_texts(_FOLDER, content)}
+        if len(names) * len(folders) ** 2 > 100 * _MOST_NAMES:
+            raise ValueError(f"names more than {_MOST_NAMES} files; join its meshes")
+        read |= left
+        left = set(_existing(root, names, folders)) - read
+
+
+def _existing(root: str, names: set[str], folders: set[str]) -> Iterator[str]:
+    """Yields the files of these names in all folders that MuJoCo may take them from."""
+    plain = {name.removeprefix("package://") for name in names}
+    places = {os.path.join(root, one, two) for one in folders for two in folders}
+    for name in plain | {os.path.basename(name) for name in plain}:
+        for place in filter(os.path.lexists, (os.path.join(place, name) for place in places)):
+            file = os.path.realpath(place)
+            if not Path(file).is_relative_to(root):
+                raise ValueError(f"names '{name}', outside of its folder; move it there")
+            if name and not os.path.isdir(file):
+                yield file
+
+
+def _texts(pattern: re.Pattern[bytes], content: bytes) -> set[str]:
+    found = {one or other for one, other in pattern.findall(content)}
+    return {html.unescape(os.fsdecode(text)) for text in found}
 
 
 def _pose(data: mujoco.MjData, geom: int) -> np.ndarray:

@@ -11,11 +11,13 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
 
+from csac_jax import reading
 from csac_jax.errors import SettingsError
 from csac_jax.objects import conversion, descriptions, library
 from csac_jax.objects.body import Object
 from csac_jax.objects.conversion import ImportSettings
 from csac_jax.objects.library import LibraryError
+from csac_jax.runtime import processes
 
 MESHES = (".obj", ".stl", ".ply", ".glb")
 MODULES = ("trimesh", "coacd")
@@ -89,9 +91,8 @@ def _convert(
     on_done: Callable[[Path, Future], None],
 ) -> list[Path]:
     """Converts files in `jobs` processes; returns those left unfinished by a process that ended."""
-    unfinished, limit = [], (resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    number = max(min(jobs, len(paths)), 1)
-    pool = ProcessPoolExecutor(number, get_context("spawn"), resource.setrlimit, limit)
+    unfinished, number = [], max(min(jobs, len(paths)), 1)
+    pool = ProcessPoolExecutor(number, get_context("spawn"), _begin)
     with contextlib.ExitStack() as stack:
         stack.callback(pool.shutdown, cancel_futures=True)
         submit = pool.submit
@@ -102,6 +103,12 @@ def _convert(
             else:
                 on_done(tasks[task], task)
     return unfinished
+
+
+def _begin() -> None:
+    """Prepares a worker: its memory is bounded and it ends with its parent."""
+    processes.end_with_parent()
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
 
 
 def _names(paths: list[Path]) -> dict[Path, str]:
@@ -116,14 +123,14 @@ def _names(paths: list[Path]) -> dict[Path, str]:
 
 def _entry(cache: Path, path: Path, settings: ImportSettings) -> Path:
     described = path.suffix.lower() in descriptions.SUFFIXES
-    content = conversion.read(path)[0] if described else path.read_bytes()
+    content = conversion.read(path)[0] if described else reading.read_bytes(path)
     text = f"{path.name} {settings.scale} {settings.density} ".encode() + content
     return cache / hashlib.sha256(text).hexdigest()[:32]
 
 
 def _cached(cache: Path, path: Path, name: str, settings: ImportSettings) -> Converted | None:
     with contextlib.suppress(LibraryError, OSError, ValueError):
-        if cache.exists() and path.stat().st_size <= conversion.MOST_BYTES:
+        if cache.exists():
             (entry,) = library.load(_entry(cache, path, settings)).objects
             return dataclasses.replace(entry, name=name), conversion.share(entry)
     return None

@@ -17,6 +17,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from csac_jax import reading
 from csac_jax.errors import FailedError
 from csac_jax.objects.body import DENSITY, Object
 from csac_jax.objects.solid import Part
@@ -25,7 +26,7 @@ Split = Literal["train", "held_out", "all"]
 FORMAT = 1
 INDEX, ARRAYS = "objects.json", "parts.npz"
 MOST_OBJECTS = 4096
-_MOST_BYTES = 2**28  # of a file
+_MOST_BYTES = {INDEX: 2**24, ARRAYS: 2**28}  # of a file
 _FIELDS = ("vertices", "triangles", "planes")  # of a part
 
 
@@ -122,8 +123,8 @@ _LOADED: dict[tuple[str, str], Library] = {}  # by folder and digest of its inde
 def load(folder: Path) -> Library:
     """Loads the library in a folder. Raises LibraryError, one line with the remedy."""
     try:
-        index = _bytes(folder / INDEX)
-        key = (str(folder.resolve()), hashlib.sha256(index).hexdigest())
+        index = reading.read_bytes(folder / INDEX, _MOST_BYTES[INDEX])
+        key = (os.path.realpath(folder), hashlib.sha256(index).hexdigest())
         if key not in _LOADED:
             _LOADED[key] = Library(tuple(_read(folder, index)), key[1])
         return _LOADED[key]
@@ -135,18 +136,13 @@ def load(folder: Path) -> Library:
         raise LibraryError(f"{folder}: damaged library: {reason}; make it again") from None
 
 
-def _bytes(path: Path) -> bytes:
-    if path.stat().st_size > _MOST_BYTES or not path.is_file():
-        raise ValueError(f"{path.name} is no file, or larger than {_MOST_BYTES >> 20} MiB")
-    return path.read_bytes()
-
-
 def _read(folder: Path, index: bytes) -> list[Object]:
     """Reads objects. Their digest is that of `save`, which needs no other check."""
     content = json.loads(index)
     if content["format"] != FORMAT:
         raise ValueError(f"format {content['format']} is unknown, this version reads {FORMAT}")
-    packed, entries = _bytes(folder / ARRAYS), content["objects"]
+    packed = reading.read_bytes(folder / ARRAYS, _MOST_BYTES[ARRAYS])
+    entries = content["objects"]
     if _digest(entries, packed) != content["sha256"]:
         raise ValueError(f"the digest in {INDEX} is not that of the files")
     parts = _parts(packed)
@@ -155,8 +151,8 @@ def _read(folder: Path, index: bytes) -> list[Object]:
 
 def _parts(packed: bytes) -> list[Part]:
     """Reads all parts of an array file, in reverse order."""
-    with np.load(io.BytesIO(packed), allow_pickle=False) as file:
-        *arrays, counts = (file[name] for name in (*_FIELDS, "counts"))
+    stored = reading.read_arrays(packed)
+    *arrays, counts = (stored[name] for name in (*_FIELDS, "counts"))
     ends = np.cumsum(counts, axis=0)[:-1].T
     rows = map(np.split, arrays, ends)
     return [Part(*fields) for fields in zip(*rows, strict=True)][::-1]

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csac_jax import reading
 from csac_jax.errors import SettingsError
 from csac_jax.io import files, renames
 from csac_jax.report import variants
@@ -133,7 +134,7 @@ def _opened(path: Path) -> Iterator[Path]:
 def _unpack(archive: tarfile.TarFile, member: tarfile.TarInfo, folder: Path) -> None:
     """Writes a regular file of an archive; skips links and what would lie elsewhere."""
     place = (folder / member.name).resolve()
-    sound = member.isreg() and member.size <= files.LARGEST and place.is_relative_to(folder)
+    sound = member.isreg() and member.size <= reading.LARGEST and place.is_relative_to(folder)
     if sound and (content := archive.extractfile(member)):
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes(content.read())
@@ -215,7 +216,7 @@ def _totals(lines: Sequence[Json]) -> dict[str, int]:
 
 def _record(folder: Path, config: Json) -> Json:
     """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
-    above = folder.resolve().parents[:2] if folder.name.startswith("seed-") else ()
+    above = Path(os.path.realpath(folder)).parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
         record = _read_json(place / files.RECORD)
         _check(record, _RECORD, files.RECORD)
@@ -225,7 +226,7 @@ def _record(folder: Path, config: Json) -> Json:
 
 
 def _evaluations(file: Path, path: Path) -> list[Evaluation]:
-    content = files.parse(files.read_bytes(file), "the file")
+    content = files.parse(reading.read_bytes(file, files.LARGEST_JSON), "the file")
     kinds = [{"policy", "config", name} for name in ("parts", "grasp_success")]
     if not isinstance(content, dict) or not any(kind <= content.keys() for kind in kinds):
         return []
@@ -275,7 +276,7 @@ def _without_evaluation(results: Results) -> Iterator[str]:
 def _variant(file: Path, path: Path, config: Json) -> Variant:
     """Builds the variant of a file. Its source is the folder; of several seeds, the one above. An
     evaluation's source also names its file. Its robot is that of the run."""
-    folder = path.resolve().parent
+    folder = Path(os.path.realpath(path)).parent
     source = folder.parent.name if folder.name.startswith("seed-") else folder.name
     if path.name != files.METRICS:
         _, robot = variants.world(_read_json(file.parent / files.CONFIG))

@@ -82,18 +82,23 @@ def _begin(free: Any, reports: Any) -> None:
     global _reports
     _reports = reports
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; one ends the others
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     os.sched_setaffinity(0, {free.get()})  # before JAX starts its threads
     from csac_jax.runtime import devices
 
     devices.select("cpu")
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Ends this process once the one that started it has ended, however that was."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os._exit(1)
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def _run(work: Callable[..., Any], task: tuple) -> Any:

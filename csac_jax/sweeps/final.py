@@ -36,7 +36,7 @@ def measure(
     name = "eval.json" if suite == OWN else f"eval-{Path(suite).stem}.json"
     for point in plan.points:
         runs = runs_of(plan._replace(points=[point]))
-        paths = {folder / run / name: cfg for run, cfg in runs.items()}
+        paths = {files.inside(folder, run, name): cfg for run, cfg in runs.items()}
         if done := sum(path.exists() for path in paths):
             reporter.log(f"{point.name}: {done} policies have their {name} already")
         saved = [path for path in paths if checkpoint.latest_step(path.parent) is not None]

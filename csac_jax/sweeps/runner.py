@@ -15,7 +15,6 @@ import dataclasses
 import hashlib
 import json
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +38,8 @@ from csac_jax.training.progress import Terminal
 
 SUMMARY = "summary.json"
 DIGEST = "sha256"  # key of the plan's own digest
-RESERVED = ("groups", files.SWEEP_PLAN, SUMMARY, "train.json")  # in the sweep's folder
+GROUPS = "groups"
+RESERVED = (GROUPS, files.SWEEP_PLAN, SUMMARY, "train.json")  # in the sweep's folder
 _NAME = re.compile(rf"[^./\\][^/\\]{{0,{grid.LONGEST - 1}}}")  # of a folder inside the sweep
 MOST_EPISODES = 100_000  # of an evaluation, ours: more is a slip of the pen
 _NO_LINE = {"step": 0, "actions": 0, "grasp_success": None, "grasps_counted": 0}
@@ -86,7 +86,7 @@ def run(
     sweep = _Sweep(folder, groups_of(plan), reporter, stop)
     with lock.exclusive(folder) if cluster.is_first() else contextlib.nullcontext():
         for index, (group, _) in enumerate(sweep.groups):
-            group_folder = folder / "groups" / str(index)
+            group_folder = files.inside(folder, GROUPS, str(index))
             if not sweep.stopping() and not (group_folder / "done").exists():
                 sweep.train_group(index, group_folder, make_program(group))
         summary = summarise(plan, folder)
@@ -157,9 +157,7 @@ def check_plan(plan: SweepPlan) -> None:
 def _check_unchanged(plan: SweepPlan, folder: Path) -> None:
     """Raises ValueError if a run has begun with another config than the plan's, or elsewhere."""
     for run, cfg in runs_of(plan).items():
-        if not (folder / run).resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"{run} is a link out of the sweep's folder")
-        if (path := folder / run / files.CONFIG).exists():
+        if (path := files.inside(folder, run, files.CONFIG)).exists():
             stored = configs.from_dict(files.read_object(path))
             if names := configs.differences(stored, cfg):
                 raise ValueError(f"{run} has other values of {', '.join(names)}")
@@ -253,7 +251,7 @@ class _GroupTraining:
         """Restores the newest checkpoint, if there is one, and cuts the logs to it."""
         self.folder, self.runs, self.program = folder, runs, program
         self.cfgs, self.cfg = group.configs, group.configs[0]
-        self.paths = [sweep / run for run in runs]
+        self.paths = [files.inside(sweep, run) for run in runs]
         self.loop_states = [loop.LoopState(0.0, [])] * len(runs)
         self.failed: list[int | None] = [None] * len(runs)  # step of a loss that is not finite
         if checkpoint.latest_step(folder) is None:
@@ -269,8 +267,9 @@ class _GroupTraining:
         if cluster.is_first():
             for cfg, path in zip(self.cfgs, self.paths, strict=True):
                 path.mkdir(parents=True, exist_ok=True)
+                files.remove_drafts(path)
                 files.write_json(path / files.CONFIG, configs.to_dict(cfg))
-                files.truncate_log(path / files.METRICS, self.step)
+                files.truncate_log(files.inside(path, files.METRICS), self.step)
 
     def title(self) -> str:
         names = list(dict.fromkeys(run.parent.name for run in self.runs))
@@ -317,7 +316,7 @@ class _GroupTraining:
                 checkpoint.save(path, self.step, state, self.cfgs[i], extra)
         if cluster.is_first():
             files.replace(self.folder / "done", "")
-            shutil.rmtree(self.folder / checkpoint.FOLDER, ignore_errors=True)
+            checkpoint.remove(self.folder)
         cluster.wait(f"finished {self.folder}")
 
 
@@ -338,7 +337,7 @@ def summarise(plan: SweepPlan, folder: Path) -> dict[str, Any]:
 
 
 def _row(folder: Path, run: Path, cfg: Config) -> dict[str, Any]:
-    log = folder / run / files.METRICS
+    log = files.inside(folder, run, files.METRICS)
     last = [_NO_LINE, *(files.read_log(log) if log.exists() else [])][-1]
     complete = last["step"] == loop.total_steps(cfg)
     known = {"seed": cfg.seed, "run_dir": run.as_posix(), "complete": complete}

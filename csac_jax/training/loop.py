@@ -151,14 +151,15 @@ def _begin(
     if resume:
         check_resumable(cfg, run_dir, at)
     files.write_json(run_dir / files.CONFIG, configs.to_dict(cfg))
+    log = files.inside(run_dir, files.METRICS)
     shapes = jax.eval_shape(init)
     if not resume:
-        files.truncate_log(run_dir / files.METRICS, 0)
+        files.truncate_log(log, 0)
         return _Start(0, LoopState(0.0, []), None, shapes, thread.submit(init))
     state, extra = checkpoint.restore(run_dir, shapes, at)
     step = int(state.step)
     checkpoint.set_aside_after(run_dir, step)
-    files.truncate_log(run_dir / files.METRICS, step)
+    files.truncate_log(log, step)
     loop_state = LoopState(extra["seconds"], extra["grasps"])
     return _Start(step, loop_state, step, shapes, thread.submit(lambda: state))
 
@@ -262,5 +263,4 @@ def mean(values: Sequence[float] | np.ndarray) -> float | None:
 
 def append(run_dir: Path, record: Record) -> None:
     """Adds a line to the log of a run."""
-    with (run_dir / files.METRICS).open("a") as log:
-        log.write(json.dumps(dataclasses.asdict(record)) + "\n")
+    files.append(run_dir / files.METRICS, json.dumps(dataclasses.asdict(record)))

@@ -23,9 +23,13 @@ def limit() -> int:
 def state_bytes(cfg: Config) -> dict[str, int]:
     """Returns the bytes of a run's state by part; tracing the networks takes seconds."""
     state = programs.abstract_state(cfg)
-    size = lambda leaf: math.prod(leaf.shape) * leaf.dtype.itemsize  # noqa: E731
     parts = {"replay": state.replay, "scenes": state.scenes, "networks": state.learner}
-    return {name: sum(map(size, jax.tree.leaves(part))) for name, part in parts.items()}
+    return {name: tree_bytes(part) for name, part in parts.items()}
+
+
+def tree_bytes(tree: Any) -> int:
+    """Returns the bytes of all leaves."""
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def check(cfg: Config, runs: int = 1) -> None:

@@ -134,6 +134,29 @@ def test_work_that_fails(
         assert text.startswith(f"csac-jax: {line}")
 
 
+@pytest.mark.parametrize("option", ["eval shipped --json", "report . --markdown", "play --png"])
+def test_a_file_that_cannot_be_written_is_named_first(
+    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, option: str
+):
+    """Claim: a folder in the place of a file to write, and a file in the place of its folder, are
+    refused before any work."""
+    Path("folder.png").mkdir()
+    Path("file").touch()
+    for place, fault in (("folder.png", "is a folder"), ("file/new.png", "that you may write")):
+        code, shown, line = _run(capsys, f"{option} {place}")
+        assert (code, shown, line.count("\n")) == (2, "", 1)
+        assert fault in line
+
+
+def test_names_that_stdout_cannot_encode_have_escapes(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a latin-1 stdout shows other letters, and bytes that are no UTF-8, with escapes."""
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    monkeypatch.setitem(cli.COMMANDS, "doctor", lambda _: print("a\u5b66\udcff") or 0)
+    assert cli.main(["doctor"]) == 0
+    assert stdout.buffer.getvalue() == b"a\\u5b66\\udcff\n"
+
+
 def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
     """Claim: `export` refuses a file that exists, and leaves it as it is."""
     Path("p.safetensors").write_text("mine")
@@ -215,6 +238,6 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
     assert Path("new/folder/out.json").is_file()
     assert Path("a/train.json").is_file()
-    Path("file").touch()
+    monkeypatch.setattr(loop, "run", lambda *_, **__: Path("file").touch() or summary)
     assert cli.main(["train", "smoke", "--run-dir", "b", "--json", "file/out.json"]) == 1
     assert Path("b/train.json").is_file()

@@ -57,6 +57,13 @@ def test_unit_of_depth_is_named(factor: float, unit: str):
     _check(depth=(wrong * mend).astype(np.float32))
 
 
+def test_depth_beyond_floats_is_refused():
+    """Claim: depth that is infinite in float32 is refused in one line."""
+    with pytest.raises(ViewError, match="depth there is inf times") as caught:
+        _check(depth=np.full(IMAGE.depth.shape, 1e308))
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("pose", "hint"),
     [

@@ -14,9 +14,9 @@ from flax import struct
 from csac_jax import presets
 from csac_jax.config import Config
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.evaluation import monitor
+from csac_jax.evaluation import monitor, policies
 from csac_jax.evaluation.monitor import EvalPlan, Monitor
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import loop
@@ -138,6 +138,23 @@ def test_run_is_what_it_is_without_evaluations(tmp_path: Path, scores: list[Any]
     _run(tmp_path / "watched", watched, every=32)
     assert _log(tmp_path / "plain/metrics.jsonl") == _log(tmp_path / "watched/metrics.jsonl")
     jax.tree.map(np.testing.assert_array_equal, plain.states, watched.states)
+
+
+def test_a_best_state_that_is_a_link_is_refused(tmp_path: Path, scores: list[Any]):
+    """Claim: a resumed run neither continues nor sets aside the best state of another run, and
+    nobody loads it from there."""
+    scores += [_table(0.7, 0.9), _table(0.7, 0.9)]
+    for name in ("one", "two"):
+        _run(tmp_path / name, Notes(stop_after=2))
+    best, other = tmp_path / "one" / "best", tmp_path / "two" / "best"
+    best.rename(tmp_path / "away")
+    best.symlink_to(other)
+    before = sorted(other.rglob("*"))
+    with pytest.raises(files.LinkError, match="best is a link"):
+        _run(tmp_path / "one", Notes(), resume=True)
+    with pytest.raises(files.LinkError, match="best is a link"):
+        policies.load(tmp_path / "one", which="best")
+    assert sorted(other.rglob("*")) == before
 
 
 def test_resumed_run_keeps_the_best(tmp_path: Path, scores: list[Any]):

@@ -14,7 +14,7 @@ from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.evaluation import policies
 from csac_jax.evaluation.policies import GeometricPolicy, NetworkPolicy, OraclePolicy, RandomPolicy
-from csac_jax.io import policy_file
+from csac_jax.io import checkpoint, policy_file
 
 pytestmark = pytest.mark.mjx
 
@@ -192,6 +192,15 @@ def test_load_reads_a_file(tmp_path, learned):
     assert policies.make("oracle", str(path)) == OraclePolicy(CFG)
     with pytest.raises(FileNotFoundError, match="there is no folder nowhere"):
         policies.load("nowhere")
+
+
+def test_a_state_that_does_not_fit_is_refused(tmp_path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: a checkpoint whose state exceeds the memory is refused before it is read."""
+    cfg = SMOKE.change(replay={"capacity": 2**30})
+    checkpoint.save(tmp_path, 1, {"step": jnp.int32(1)}, cfg, {})
+    monkeypatch.setattr(checkpoint, "restore", None)
+    with pytest.raises(checkpoint.CheckpointError, match=r"its state takes \d+\.\d GiB"):
+        policies.load(tmp_path)
 
 
 def test_policy_of_a_module(tmp_path, monkeypatch: pytest.MonkeyPatch):

@@ -1,11 +1,12 @@
 """Injects all faults, or those whose names hold one of the arguments.
 
-    python -m tests.faults [NAME ...]
+    python -m tests.faults [--seed N] [NAME ...]
 
-Prints the table; all faults together write it into docs/reliability.md. Exits with 1 if a try went
-wrong.
+Prints the table; all faults together, without a seed, write it into docs/reliability.md. Exits with
+1 if a try went wrong.
 """
 
+import argparse
 import os
 import sys
 import tempfile
@@ -23,7 +24,7 @@ PAGE = harness.ROOT / "docs/reliability.md"
 BEGIN, END = "<!-- faults: begin -->", "<!-- faults: end -->"
 
 
-def main(names: list[str]) -> int:
+def main(names: list[str], seed: int | None) -> int:
     faults = harness.load()
     chosen = [one for one in faults.values() if not names or any(n in one.name for n in names)]
     tallies: list[tuple[str, harness.Tally]] = []
@@ -31,7 +32,7 @@ def main(names: list[str]) -> int:
         begun = time.monotonic()
         with tempfile.TemporaryDirectory(prefix="csac-jax-faults-") as folder:
             try:
-                tally = harness.run(one, one.tries, Path(folder))
+                tally = harness.run(one, one.tries, Path(folder), seed)
             except harness.MissingToolError as error:
                 print(f"{one.name}: not tried, {error}", flush=True)
                 continue
@@ -42,7 +43,7 @@ def main(names: list[str]) -> int:
             print(f"  {remark}", flush=True)
     text = harness.table(tallies)
     print(text, end="")
-    if len(tallies) == len(faults):
+    if len(tallies) == len(faults) and seed is None:
         PAGE.write_text(with_table(PAGE.read_text(), text))
     return int(any(tally.bad for _, tally in tallies))
 
@@ -53,4 +54,8 @@ def with_table(page: str, text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--seed", type=int)
+    given = parser.parse_args()
+    sys.exit(main(given.names, given.seed))

@@ -78,10 +78,11 @@ def load() -> dict[str, Fault]:
     return FAULTS
 
 
-def run(one: Fault, tries: int, folder: Path) -> Tally:
-    """Injects a fault; its tries are the same at every call."""
-    tally = Tally()
-    one.inject(tally, np.random.default_rng(zlib.crc32(one.name.encode())), tries, folder)
+def run(one: Fault, tries: int, folder: Path, seed: int | None = None) -> Tally:
+    """Injects a fault; its tries are the same at every call with the same seed."""
+    tally, name = Tally(), zlib.crc32(one.name.encode())
+    rng = np.random.default_rng([name] if seed is None else [name, seed])
+    one.inject(tally, rng, tries, folder)
     return tally
 
 

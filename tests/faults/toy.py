@@ -60,15 +60,16 @@ def abstract_state() -> Any:
     return jax.eval_shape(first_state)
 
 
-def compile_chunk(num_steps: int) -> Any:
-    def step(state: State, _: None) -> tuple[State, StepMetrics]:
-        outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
-        total = state.total + state.step.astype(jnp.float32)
-        packed = 3 * state.packed + jnp.arange(64, dtype=jnp.uint16)[None]
-        shown = {"outcome": outcome, "reward": outcome.astype(jnp.float32)}
-        metrics = step_metrics(E, loss=jnp.float32(1.0), primitive=jnp.ones(E, jnp.int32), **shown)
-        return State(state.key, state.step + 1, total, packed), metrics
+def step(state: State, _: None) -> tuple[State, StepMetrics]:
+    outcome = (jnp.arange(E, dtype=jnp.int32) + state.step) % 5
+    total = state.total + state.step.astype(jnp.float32)
+    packed = 3 * state.packed + jnp.arange(64, dtype=jnp.uint16)[None]
+    shown = {"outcome": outcome, "reward": outcome.astype(jnp.float32)}
+    metrics = step_metrics(E, loss=jnp.float32(1.0), primitive=jnp.ones(E, jnp.int32), **shown)
+    return State(state.key, state.step + 1, total, packed), metrics
 
+
+def compile_chunk(num_steps: int) -> Any:
     return jax.jit(lambda state: jax.lax.scan(step, state, length=num_steps), donate_argnums=0)
 
 
@@ -104,8 +105,8 @@ def bits(state: State) -> bytes:
 class Reference:
     """The states and records of an uninterrupted run, by step."""
 
-    def __init__(self) -> None:
-        self._chunk, self._state = compile_chunk(1), first_state()
+    def __init__(self, seed: int = 5) -> None:
+        self._chunk, self._state = compile_chunk(1), first_state(seed)
         self.states = [bits(self._state)]
         self.outcomes: list[dict[str, int]] = []
 

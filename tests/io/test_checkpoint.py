@@ -1,9 +1,11 @@
 """Checkpoints: what comes back, and what is refused."""
 
+import contextlib
 import dataclasses
 import json
 import shutil
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +19,7 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.errors import DataWarning
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.io.checkpoint import CheckpointError
 
 CFG = presets.smoke()
@@ -107,6 +109,60 @@ def test_last_two_are_kept(run_dir: Path):
     assert checkpoint.latest_step(run_dir) == 12
 
 
+@pytest.mark.parametrize("name", ["checkpoints", "set-aside", ".saving", "2", "12"])
+def test_links_are_not_followed(run_dir: Path, tmp_path_factory: pytest.TempPathFactory, name: str):
+    """Claim: a link among a run's checkpoints is refused, or replaced, and its target stays."""
+    other, root = tmp_path_factory.mktemp("other"), run_dir / "checkpoints"
+    checkpoint.save(other, 3, _state(3), CFG, {})
+    (other / "checkpoints" / "run").unlink()  # an old one, which no name gives away
+    place, target = root / name, other / "checkpoints" / "3"
+    if name == "checkpoints":
+        place, target = root, other / "checkpoints"
+        root.rename(run_dir / "away")
+    place.symlink_to(target)
+    before = [(path, path.read_bytes()) for path in sorted(other.rglob("*")) if path.is_file()]
+    with contextlib.suppress(files.LinkError):
+        checkpoint.save(run_dir, 12, _state(12), CFG, {})
+        checkpoint.set_aside_after(run_dir, 8)
+        checkpoint.remove(run_dir)
+    after = [(path, path.read_bytes()) for path in sorted(other.rglob("*")) if path.is_file()]
+    assert after == before
+    assert place.is_symlink() == (name in ("checkpoints", "set-aside"))
+
+
+@pytest.mark.parametrize("name", ["a*", "a?", "[a]", "a\\b", "a\udcff"])
+def test_paths_that_orbax_misreads_are_refused(tmp_path: Path, name: str):
+    """Claim: a path with a sign of a pattern, or that is no UTF-8, is refused in one line."""
+    checkpoint.check_path(tmp_path / "a b")
+    with pytest.raises(CheckpointError, match="no checkpoint can be saved in a path with"):
+        checkpoint.check_path(tmp_path / name)
+
+
+def test_extra_content_comes_back(run_dir: Path):
+    """Claim: what was saved beside the state is read without it."""
+    assert checkpoint.load_extra(run_dir) == {"seconds": 4.0, "grasps": [0, 1]}
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda step: (step / "extra" / "metadata").write_text("{}"), "is no checkpoint of csac"),
+        (lambda step: (step / "state" / "manifest.ocdbt").write_text("x"), "cannot be read"),
+    ],
+)
+def test_sound_files_of_another_program_are_refused(
+    run_dir: Path, damage: Callable[[Path], None], message: str
+):
+    """Claim: files whose digests are right and whose content is another's are one line."""
+    step = run_dir / "checkpoints" / "8"
+    damage(step)
+    files.write_json(step / checkpoint.MANIFEST, {})
+    files.write_json(step / checkpoint.MANIFEST, checkpoint._digests(step))
+    with pytest.raises(CheckpointError, match=message) as caught:
+        checkpoint.restore(run_dir, _abstract(), 8)
+    assert "\n" not in str(caught.value)
+
+
 def test_temporary_folders_are_removed(run_dir: Path):
     """Claim: what a killed save left behind is no step, and the next save removes it."""
     left = run_dir / "checkpoints" / "10.orbax-checkpoint-tmp"
@@ -168,7 +224,13 @@ def test_what_orbax_left_out_is_no_checkpoint(
 def test_threads_that_write_on_leave_no_draft(run_dir: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: what Orbax's threads still write after a save has failed is removed too."""
     late = run_dir / "checkpoints" / ".saving.orbax-checkpoint-tmp" / "state"
-    writer = threading.Timer(0.15, late.mkdir, kwargs={"parents": True})
+
+    def write() -> None:
+        for _ in range(3):
+            time.sleep(0.3)
+            late.mkdir(parents=True, exist_ok=True)
+
+    writer = threading.Thread(target=write)
 
     def fail(*_: Any, **__: Any) -> None:
         writer.start()

@@ -258,6 +258,27 @@ def test_fault_names_file_and_key(tmp_path: Path, suffix: str, text: str, messag
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "text", "message"),
+    [
+        (".yaml", "preset: [" + "[" * 100_000, "has 100001 brackets, more than 1000"),
+        (".yaml", "preset: " + "{" * 100_000, "has 100000 brackets"),
+        (".toml", "a." * 50_000 + "a = 1", "has a line of 100005 characters"),
+        (".toml", "#\n" * 2**17, "larger than 128 KiB"),
+    ],
+)
+def test_texts_that_take_the_square_of_their_length(
+    tmp_path: Path, suffix: str, text: str, message: str
+):
+    """Claim: nested lists without end, and keys of many parts, are refused within a second."""
+    path = tmp_path / f"my{suffix}"
+    path.write_text(text)
+    begun = time.monotonic()
+    with pytest.raises(SettingsError, match=message):
+        configs.load_config(path)
+    assert time.monotonic() - begun < 1.0
+
+
 def test_missing_or_contradicting_file_is_named(tmp_path: Path):
     """Claim: a file that is not there, a folder, or one of another preset is one line."""
     (tmp_path / "folder.toml").mkdir()

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import os
 import shutil
+import tracemalloc
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -140,6 +142,56 @@ def test_other_files_are_refused(tmp_path: Path, params: Params, change: Callabl
         policy_file.load(path)
     path.write_bytes(b"\x80\x04not this")
     with pytest.raises(PolicyFileError, match=r"cannot be read as \.safetensors"):
+        policy_file.load(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"heightmap": {"size": 2**31}},
+        {"heightmap": {"size": 1024}, "net": {"rotations": 360}},
+        {"net": {"head": 2**31}},
+        {"cem": {"candidates": 2**31}},
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_sizes_are_checked_before_memory_is_taken(tmp_path: Path, params: Params, change: dict):
+    """Claim: a policy whose config has sizes that no machine has room for is refused at once, with
+    no memory taken for them."""
+    path, config = tmp_path / "policy.safetensors", configs.to_dict(CFG)
+    policy_file.save(path, params, CFG)
+    for name, values in change.items():
+        config[name] |= values
+    _rewrite(path, lambda _, remarks: remarks.update(config=json.dumps(config)))
+    tracemalloc.start()
+    with pytest.raises(PolicyFileError, match=r"heightmap\.size|must be at most"):
+        policy_file.load(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24
+
+
+@pytest.mark.parametrize("kind", ["fifo", "sparse"])
+def test_only_regular_files_of_a_size_are_read(tmp_path: Path, kind: str):
+    """Claim: a pipe, and a file larger than 1 GiB, are refused before they are read."""
+    path = tmp_path / "policy.safetensors"
+    if kind == "fifo":
+        os.mkfifo(path)
+    else:
+        path.touch()
+        os.truncate(path, 2**30 + 1)
+    with pytest.raises(PolicyFileError, match="a pipe or a device, or larger than 1048576 KiB"):
+        policy_file.load(path)
+
+
+def test_damage_is_seen(tmp_path: Path, params: Params):
+    """Claim: a number that has changed is refused by the digest."""
+    path = tmp_path / "policy.safetensors"
+    policy_file.save(path, params, CFG)
+    content = bytearray(path.read_bytes())
+    content[-9] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileError, match="is damaged: its digest differs"):
         policy_file.load(path)
 
 

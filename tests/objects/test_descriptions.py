@@ -1,5 +1,6 @@
 """URDF and MJCF files as one closed mesh."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,43 @@ REFUSED = {
     "missing.urdf": (_URDF.format(mesh="b.obj", more=""), "b.obj"),
     "hinge.urdf": (_URDF.format(mesh="a.obj", more=_HINGE), "an object is one rigid body"),
 }
+
+
+_ASSETS = "<mujoco><compiler {}/><asset>{}</asset></mujoco>"
+ELSEWHERE = {
+    "include": '<mujoco><include file="{}"/></mujoco>',
+    "model": _ASSETS.format("", '<model name="a" file="{}"/>'),
+    "mesh": _ASSETS.format("", '<mesh name="a" file="{}"/>'),
+    "texture": _ASSETS.format("", '<texture type="2d" name="a" file="{}"/>'),
+    "side of a texture": _ASSETS.format("", '<texture type="cube" name="a" fileright="{}"/>'),
+    "heights": _ASSETS.format("", '<hfield name="a" file="{}" size="1 1 1 1"/>'),
+    "URDF": _URDF.format(mesh="{}", more=""),
+    "entity": _ASSETS.format("", "<mesh name='a' file='{}'/>").replace("{}", "&#46;/{}"),
+}
+
+
+@pytest.mark.parametrize("kind", ELSEWHERE)
+@pytest.mark.parametrize("place", ["../out.stl", "pipe.stl", "link.stl", "sub", "by_include"])
+def test_only_regular_files_below_the_folder_are_opened(tmp_path: Path, kind: str, place: str):
+    """Claim: a description that names a file elsewhere, a pipe or a link out of its folder, itself
+    or in a file that it includes, is refused before anything is opened."""
+    folder = tmp_path / "inside"
+    (folder / "sub").mkdir(parents=True)
+    os.mkfifo(tmp_path / "out.stl")
+    os.mkfifo(folder / "pipe.stl")
+    os.mkfifo(folder / "sub" / "deep.stl")
+    (folder / "link.stl").symlink_to(tmp_path / "out.stl")
+    text = ELSEWHERE[kind].format("pipe.stl" if place == "by_include" else place)
+    if place == "sub":
+        text = ELSEWHERE[kind].format("deep.stl")
+        _text(folder, "dirs.xml", _ASSETS.format('meshdir="sub" texturedir="sub"', ""))
+        text = text.replace("</mujoco>", '<include file="dirs.xml"/></mujoco>')
+        text = text.replace("<robot", '<robot meshdir="sub"')
+    if place == "by_include":
+        _text(folder, "more.xml", text)
+        text = '<mujoco><include file="more.xml"/></mujoco>'
+    with pytest.raises((ValueError, OSError), match=r"outside of its folder|a pipe"):
+        descriptions.read(_text(folder, "a.xml", text))
 
 
 @pytest.mark.usefixtures("bent")

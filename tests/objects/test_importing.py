@@ -1,5 +1,11 @@
 """Mesh files into objects: reading, mending, refusals."""
 
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +13,7 @@ import pytest
 import trimesh
 
 from csac_jax import cli
+from csac_jax.errors import SettingsError
 from csac_jax.objects import conversion, importing, library, solid
 from csac_jax.objects.body import Object
 from csac_jax.objects.conversion import ImportSettings
@@ -107,6 +114,49 @@ def test_what_cannot_be_taken_is_named(tmp_path: Path, name: str):
     with pytest.raises(ValueError, match=message) as caught:
         _convert(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_pipe_is_refused(tmp_path: Path):
+    """Claim: a pipe in the place of a mesh is refused, and not waited for."""
+    os.mkfifo(tmp_path / "a.stl")
+    with pytest.raises(OSError, match="a pipe"):
+        _convert(tmp_path / "a.stl")
+    with pytest.raises(SettingsError, match="no mesh file"):
+        importing.files([tmp_path / "a.stl"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_import(tmp_path: Path, number: signal.Signals):
+    """Claim: an import that is killed leaves no worker."""
+    knot = trimesh.creation.torus(0.05, 0.02, 96, 48)
+    paths = [_file(tmp_path, knot, f"{name}.stl") for name in range(4)]
+    program = ["-m", "csac_jax", "objects", "import", *map(str, paths), "--jobs", "2"]
+    root = str(Path(__file__).parents[2])
+    process = subprocess.Popen(
+        [sys.executable, *program, "--out", str(tmp_path / "lib")],
+        env={**os.environ, "PYTHONPATH": root},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    _wait_until(lambda: len(_workers(process.pid)) == 2, 60)
+    workers = _workers(process.pid)
+    process.send_signal(number)
+    process.wait(20)
+    _wait_until(lambda: not any(Path(f"/proc/{worker}/cmdline").exists() for worker in workers), 20)
+
+
+def _workers(parent: int) -> list[str]:
+    """Lists the spawned processes of a pool, which have begun."""
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    started = [one for one in children if Path(f"/proc/{one}/stat").exists()]
+    return [one for one in started if b"spawn_main" in Path(f"/proc/{one}/cmdline").read_bytes()]
+
+
+def _wait_until(holds: Callable[[], bool], limit: float) -> None:
+    end = time.monotonic() + limit
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.1)
 
 
 @pytest.mark.slow

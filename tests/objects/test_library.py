@@ -1,10 +1,14 @@
 """Libraries as files."""
 
+import io
 import json
 import os
 import shutil
 import subprocess
 import sys
+import tracemalloc
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +96,36 @@ def test_a_damaged_file_is_named(copy: Path, name: str, damage: str):
     with pytest.raises(LibraryError) as caught:
         library.load(copy)
     assert "\n" not in str(caught.value)
+
+
+def _header(shape: int) -> bytes:
+    np.lib.format.write_array_header_1_0(
+        header := io.BytesIO(), {"descr": "|u1", "fortran_order": False, "shape": (shape,)}
+    )
+    return header.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "compression", "message"),
+    [
+        (lambda: _header(2**36) + bytes(9), zipfile.ZIP_STORED, "not as large as its header"),
+        (lambda: _header(2**24) + bytes(2**24), zipfile.ZIP_DEFLATED, "compressed or overlap"),
+    ],
+)
+def test_arrays_that_unpack_to_more_are_refused(
+    copy: Path, content: Callable[[], bytes], compression: int, message: str
+):
+    """Claim: an array that claims more than its file holds, or that is compressed, is refused
+    before memory is taken for it, whatever the digest says."""
+    with zipfile.ZipFile(copy / library.ARRAYS, "w", compression) as archive:
+        archive.writestr("vertices.npy", content())
+    _edit(copy)
+    tracemalloc.start()
+    with pytest.raises(LibraryError, match=message):
+        library.load(copy)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**22
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Pictures and videos, read back from their files."""
 
+import gc
+import resource
 import warnings
 from pathlib import Path
 
@@ -25,6 +27,26 @@ def test_picture_has_the_format_of_its_suffix(tmp_path: Path, suffix: str):
         assert image.format == {"jpg": "JPEG"}.get(suffix[1:], suffix[1:].upper())
         off = np.abs(np.asarray(image.convert("RGB")).astype(int) - 90).max()
         assert off <= (0 if suffix == ".png" else 2)
+
+
+@pytest.mark.parametrize(
+    "name", [*(f"a{suffix}" for suffix in media.PICTURES), "video.gif", "video.mp4"]
+)
+def test_a_full_disc_is_one_error(tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str):
+    """Claim: where the disc is full a picture or a video is one OSError, and no file is left."""
+    noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
+    video = name.startswith("video")
+    write = media.write_video if video else media.write_picture
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large|is the disc full\?"):
+            write(tmp_path / name, [noise, noise[::-1]] if video else noise)
+        gc.collect()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", media.VIDEOS)

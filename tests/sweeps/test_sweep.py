@@ -1,6 +1,7 @@
 """The host's loop of a sweep, with a tiny program in place of the learner."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac_jax.errors import SettingsError
-from csac_jax.io import checkpoint
+from csac_jax.io import checkpoint, files
 from csac_jax.replay import ring
 from csac_jax.runtime.signals import Stop
 from csac_jax.sweeps import runner
@@ -232,13 +233,47 @@ def test_bad_folders(tmp_path: Path):
         runner.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
 
 
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep that was stopped in its second group."""
+    folder = tmp_path_factory.mktemp("stopped") / "run"
+    _run(folder, Listener(CHUNKS + 2))
+    return folder
+
+
+@pytest.mark.parametrize("target", ["another sweep", "another part of it"])
 @pytest.mark.parametrize(
-    "name", ["../victim", "..", ".", "", "/", "a/../../victim", "a\0b", None, 7, "groups", "link"]
+    "link", ["groups", "groups/1", "groups/1/checkpoints", "b", "b/seed-5", "b/seed-5/checkpoints"]
+)
+def test_links_below_a_sweep_are_not_followed(stopped: Path, tmp_path: Path, link: str, target):
+    """Claim: a link below a sweep, to another sweep or within it, ends it in one line; what the
+    link leads to stays as it was."""
+    folder, other = tmp_path / "run", tmp_path / "other"
+    shutil.copytree(stopped, folder)
+    shutil.copytree(stopped, other)
+    place = folder / link
+    away = place.with_name("away") if target == "another part of it" else other / link
+    if place.exists():
+        place.rename(place.with_name("away"))
+    away.mkdir(exist_ok=True)
+    place.symlink_to(away)
+    before = _content(away)
+    with pytest.raises(files.LinkError, match="is a link; put") as caught:
+        runner.run(runner.read_plan(folder), folder, Programs(), Listener(), Stop(), resume=True)
+    assert "\n" not in str(caught.value)
+    assert _content(away) == before
+
+
+def _content(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    "name", ["../victim", "..", ".", "", "/", "a/../../victim", "a\0b", None, 7, "groups"]
 )
 def test_names_that_lead_elsewhere_are_refused(tmp_path: Path, name: Any):
-    """Claim: a sweep.json whose runs would lie elsewhere, by a link too, or in the sweep's own
-    folders, is refused in one line."""
-    (tmp_path / "link").symlink_to(tmp_path.parent)
+    """Claim: a sweep.json whose runs would lie elsewhere, or in the sweep's own folders, is refused
+    in one line."""
     plan = SweepPlan(2, [SweepPoint(name, {}, CFG)])
     (tmp_path / "sweep.json").write_text(runner.plan_text(plan))
     with pytest.raises(SweepError, match=r"sweep\.json") as caught:
