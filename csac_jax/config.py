@@ -111,12 +111,8 @@ class SimConfig(Section, section="sim"):
     """Friction of the pads, drawn by episode; 0: the gripper's (for own grippers)."""
     grip_force: Pair = number((0.0, 0.0), 0.0, 200.0)
     """Force of the grip, N, drawn by episode; 0: the gripper's (for own grippers)."""
-    grasp_phases: tuple[int, int, int] = number(
-        (60, 50, 80), 1, 10**5
-    )  # Substeps: down, close, lift.
-    geom_pairs: int = number(
-        12, 1, 4096
-    )  # Geom pairs examined per collision function, the nearest.
+    grasp_phases: tuple[int, int, int] = number((60, 50, 80), 1, 10**5)  # Steps: down, close, lift.
+    geom_pairs: int = number(12, 1, 4096)  # Geom pairs examined per collision function, nearest.
     contacts: int = number(48, 1, 2**16)  # Contacts that MJX and Warp keep per step.
 
     def check(self) -> None:
