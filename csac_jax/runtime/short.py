@@ -23,7 +23,7 @@ def text(value: Any) -> str:
 
 def _field(value: Any) -> str:
     if isinstance(value, Config):
-        return repr(value)
+        return f"<{value.preset}, {value.algo}, seed {value.seed}>"
     kind: Any = type(value)
     if kind.__repr__ is text:
         return text(value)

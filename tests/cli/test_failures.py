@@ -238,6 +238,6 @@ def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):
     assert cli.main(["train", "smoke", "--run-dir", "a", "--json", "new/folder/out.json"]) == 0
     assert Path("new/folder/out.json").is_file()
     assert Path("a/train.json").is_file()
-    monkeypatch.setattr(loop, "run", lambda *_, **__: Path("file").touch() or summary)
+    monkeypatch.setattr(loop, "run", lambda *of, **_: Path("file").touch() or run(*of))
     assert cli.main(["train", "smoke", "--run-dir", "b", "--json", "file/out.json"]) == 1
     assert Path("b/train.json").is_file()
