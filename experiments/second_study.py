@@ -15,6 +15,7 @@ import argparse
 import io
 import itertools
 import json
+import os
 import subprocess
 import sys
 import tarfile
@@ -238,7 +239,7 @@ def run(chosen: Sequence[Arm], folder: Path, minutes: float, evaluator: list[str
     timer = threading.Timer(60.0 * minutes, lambda: setattr(stop, "signal", stop.signal or 15))
     timer.daemon = True
     timer.start()
-    helper = subprocess.Popen(evaluator)
+    helper = _start(evaluator)
     for arm in chosen:
         if is_trained(arm, folder):
             continue
@@ -250,10 +251,15 @@ def run(chosen: Sequence[Arm], folder: Path, minutes: float, evaluator: list[str
             break
         train(arm, folder, stop)
         if helper.poll() is not None:
-            helper = subprocess.Popen(evaluator)
+            helper = _start(evaluator)
     _evaluated(helper, evaluator, stop)
     timer.cancel()
     return all(is_trained(arm, folder) and not left(arm, folder) for arm in chosen)
+
+
+def _start(evaluator: list[str]) -> subprocess.Popen:
+    """Starts a process whose JAX leaves the GPU alone."""
+    return subprocess.Popen(evaluator, env=os.environ | {"JAX_PLATFORMS": "cpu"})
 
 
 def _evaluated(
@@ -261,7 +267,7 @@ def _evaluated(
 ) -> subprocess.Popen:
     """Waits for the evaluations under way, then for those that are left; ends them at a stop."""
     for last in (helper, None):
-        process = last or subprocess.Popen(evaluator)
+        process = last or _start(evaluator)
         while process.poll() is None and stop.signal is None:
             time.sleep(0.2)
         process.terminate()

@@ -14,13 +14,14 @@ from scipy import stats
 
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import result_tables, results
-from csac_jax.report.results import Evaluation
+from csac_jax.report import comparison, result_tables, results
+from csac_jax.report.results import RecordedRun
 
 MARGIN = 0.05  # of completion, within which arms are equal
 ALPHA = 0.05
 PERMUTATIONS = 100_000  # most, drawn at random where there are more
 COMPLETION = "completion"
+LIFTS, EARLY = "action_efficiency_grasps", 500  # of the paper's claims: a metric, actions
 BESIDE = ("action_efficiency", "pushes_per_episode")  # other metrics of an arm
 SAMPLERS = ("prioritised", "beta", "geometric", "reaper")  # that H3 compares with uniform replay
 CONTROLLED = ("H3", "H6", "H7")  # in which no row counts if the control differs
@@ -92,10 +93,10 @@ def hypotheses() -> dict[str, list[Row]]:
 
 
 @functools.cache
-def read(archives: Path, part: str) -> list[Evaluation]:
-    """Reads the evaluations of a part's archive; none where there is no archive."""
+def read(archives: Path, part: str) -> results.Results:
+    """Reads a part's archive; nothing where there is none."""
     path = archives / f"second-{part}{results.ARCHIVE}"
-    return results.read([path]).evaluations if path.exists() else []
+    return results.read([path] if path.exists() else [])
 
 
 def values(
@@ -109,7 +110,7 @@ def values(
     found: dict[tuple[str, str], list[float]] = {}
     for place in places:
         part, _, name = place.partition("/")
-        for one in read(archives, part):
+        for one in read(archives, part).evaluations:
             arm, _, seed = one.path.parts[-4:-1]
             if (arm, one.suite) == (name, suite) and (not parts or one.part in parts):
                 found.setdefault((place, seed), []).append(one.metrics[metric]["value"])
@@ -162,8 +163,33 @@ def report(archives: Path, places: Sequence[str]) -> str:
         for name, rows in found.items()
         if rows
     ]
-    arms = list(_arm_rows(archives, places))
-    return "\n".join([*sections, *([result_tables.table_text(arms)] if arms else [])])
+    tables = list(claims(archives)), list(_arm_rows(archives, places))
+    return "\n".join([*sections, *(result_tables.table_text(rows) for rows in tables if rows)])
+
+
+def claims(archives: Path) -> Iterator[dict[str, str]]:
+    """Yields a row per method of what the paper claims of it; interquartile means over seeds."""
+    for name, runs in comparison.grouped(read(archives, "methods").runs, _arm_of).items():
+        suite = functools.partial(values, archives, [f"methods/{name}"], "target")
+        columns = {
+            "completion": (COMPLETION, suite()),
+            "lifts / grasp": (LIFTS, suite(metric=LIFTS)),
+            "training success": (COMPLETION, [run.success[-1] for run in runs]),
+            f"area, {EARLY} actions": (COMPLETION, list(map(_early, runs))),
+        }
+        cells = {
+            title: result_tables.shown(statistics.band([column]), "", metric)
+            for title, (metric, column) in columns.items()
+        }
+        yield {"method": name, **cells, "seconds": f"{np.mean([r.seconds[-1] for r in runs]):.0f}"}
+
+
+def _arm_of(run: RecordedRun) -> str:
+    return run.path.parts[-4]
+
+
+def _early(run: RecordedRun) -> float:
+    return statistics.area(run.actions, run.success, EARLY)
 
 
 def _row(name: str, found: Difference) -> dict[str, str]:
@@ -175,7 +201,7 @@ def _arm_rows(archives: Path, places: Sequence[str]) -> Iterator[dict[str, str]]
     """Yields a row per arm, suite and part: three averages over seeds, and what pushes cost."""
     for place in places:
         part, _, name = place.partition("/")
-        found = [one for one in read(archives, part) if one.path.parts[-4] == name]
+        found = [one for one in read(archives, part).evaluations if one.path.parts[-4] == name]
         for suite, scene in dict.fromkeys((one.suite, one.part) for one in found):
             column = functools.partial(values, archives, [place], suite, [scene])
             yield {"arm": place, "suite": suite, "part": scene, **_cells(column)}

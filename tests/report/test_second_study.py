@@ -241,6 +241,36 @@ def test_a_control_that_differs_voids(recorded: Callable[..., Path]):
         assert ("**H3** (completion, points; the control differs" in report) == is_void
 
 
+def test_claims_by_hand(recorded: Callable[..., Path], tmp_path: Path):
+    """Claim: a method's row has completion and lifts per grasp over the parts of `target`, success
+    over the last grasps of training, its area over the first 500 actions, and seconds."""
+    lifts = {name: np.array([0.2, 0.6]) for name in (*METRICS, "action_efficiency_grasps")}
+    parts = {("methods/vpg", "target", part): lifts for part in ("hole", "row")}
+    archives = recorded(parts)
+    config = configs.to_dict(algorithms.configure(presets.get("paper_small"), "vpg"))
+    contents = {"config.json": json.dumps(config)}
+    for seed, final in ((1000, 0.8), (1001, 0.6)):
+        folder = tmp_path / "runs" / "methods" / "vpg" / "base" / f"seed-{seed}"
+        rows = [(250, 0.2), (500, 0.4), (2500, final)]  # 0.2 before, and linear in between
+        keys = ("actions", "grasp_success", "grasps_counted", "seconds", "step")
+        lines = [dict(zip(keys, (n, share, 200, n / 10, n), strict=True)) for n, share in rows]
+        contents["metrics.jsonl"] = "\n".join(map(json.dumps, lines)) + "\n"
+        for name, text in contents.items():
+            (folder / name).write_text(text)
+    paths = list((tmp_path / "runs" / "methods").rglob("*.json*"))
+    archive = archives / "second-methods.tar.xz"
+    second_study._write_archive(archive, "a test", tmp_path / "runs" / "methods", paths)
+    (row,) = second_tables.claims(archives)
+    assert {title: cell.split(" (")[0] for title, cell in row.items()} == {
+        "method": "vpg",
+        "completion": "40.0 %",
+        "lifts / grasp": "40.0 %",
+        "training success": "70.0 %",
+        "area, 500 actions": "25.0 %",
+        "seconds": "250",
+    }
+
+
 def test_cells_are_recomputed(recorded: Callable[..., Path]):
     """Claim: ten cells of the tables follow from the archives by another way: plain JSON, SciPy's
     trimmed mean, a sorted quarter. Without archives of the study, from made ones."""
