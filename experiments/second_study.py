@@ -15,6 +15,7 @@ import argparse
 import io
 import itertools
 import json
+import operator
 import os
 import subprocess
 import sys
@@ -30,6 +31,7 @@ from rich.console import Console
 
 from csac_jax import api
 from csac_jax.cli import sweep as command
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.io import files
 from csac_jax.replay.samplers import Sampler
 from csac_jax.report import result_tables, results
@@ -175,7 +177,8 @@ def plan_of(arm: Arm, folder: Path) -> SweepPlan:
 
 
 def best_settings(arm: Arm, folder: Path) -> str:
-    """Returns the flags of the searched setting with most completion; the first of equal ones."""
+    """Returns the flags of the searched setting with most completion; of equal ones the
+    first by name."""
     searched = folder / "search" / arm.name
     require((searched / files.SWEEP_PLAN).exists(), f"{searched}: run the search first")
 
@@ -184,7 +187,8 @@ def best_settings(arm: Arm, folder: Path) -> str:
         require(len(paths) > 0, f"{searched}: evaluate the search first")
         return float(np.mean([files.read_object(path)["completion"]["value"] for path in paths]))
 
-    best = max(runner.read_plan(searched).points, key=completion)
+    points = sorted(runner.read_plan(searched).points, key=operator.attrgetter("name"))
+    best = max(points, key=completion)
     flags = [f"--{key.replace('_', '-')} {value}" for key, value in best.values.items()]
     return " ".join(flags).replace(":", " ")
 
@@ -346,6 +350,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=max(1, processes.cores() - RESERVED))
     parser.add_argument("--smoke", action="store_true", help="one tiny arm, for a test")
     options = parser.parse_args(arguments)
+    try:
+        return call(options)
+    except (FailedError, SettingsError) as error:
+        print(f"second_study: {error}", file=sys.stderr)
+        return 1
+
+
+def call(options: argparse.Namespace) -> int:
+    """Carries out a command; returns the exit code."""
     chosen = smoke_arms() if options.smoke else arms()
     if options.command == "run":
         own = [sys.executable, "-m", "experiments.second_study", "evaluate", str(options.folder)]

@@ -15,7 +15,7 @@ from scipy import stats
 from csac_jax.evaluation import statistics
 from csac_jax.evaluation.statistics import Band
 from csac_jax.report import comparison, result_tables, results
-from csac_jax.report.results import RecordedRun
+from csac_jax.report.results import Evaluation, RecordedRun
 
 MARGIN = 0.05  # of completion, within which arms are equal
 ALPHA = 0.05
@@ -163,8 +163,28 @@ def report(archives: Path, places: Sequence[str]) -> str:
         for name, rows in found.items()
         if rows
     ]
-    tables = list(claims(archives)), list(_arm_rows(archives, places))
+    shown = [place for place in places if not place.startswith("search/")]
+    tables = list(searched(archives)), list(claims(archives)), list(_arm_rows(archives, shown))
     return "\n".join([*sections, *(result_tables.table_text(rows) for rows in tables if rows)])
+
+
+def searched(archives: Path) -> Iterator[dict[str, str]]:
+    """Yields a row per method: the searched setting with most completion, and that with most blocks
+    per action; of equal ones the first by name."""
+    evaluations = read(archives, "search").evaluations
+    for method, found in comparison.grouped(evaluations, _arm_of).items():
+        settings = comparison.grouped(found, lambda one: one.path.parts[-3])
+        best = {results.METRICS[name]: _best(settings, name) for name in (COMPLETION, BESIDE[0])}
+        yield {"searched": method, **best}
+
+
+def _best(settings: dict[str, list[Evaluation]], metric: str) -> str:
+    means = {
+        name: np.mean([one.metrics[metric]["value"] for one in group])
+        for name, group in settings.items()
+    }
+    name = max(means, key=lambda name: means[name])
+    return f"{name}: {means[name]:.3f}"
 
 
 def claims(archives: Path) -> Iterator[dict[str, str]]:
@@ -184,7 +204,7 @@ def claims(archives: Path) -> Iterator[dict[str, str]]:
         yield {"method": name, **cells, "seconds": f"{np.mean([r.seconds[-1] for r in runs]):.0f}"}
 
 
-def _arm_of(run: RecordedRun) -> str:
+def _arm_of(run: RecordedRun | Evaluation) -> str:
     return run.path.parts[-4]
 
 

@@ -92,8 +92,9 @@ def test_arms_can_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 
 def test_search_chooses_by_completion(tmp_path: Path):
-    """Claim: a method has the searched setting with most completion over its seeds; without a
-    search there is one clear line."""
+    """Claim: a method has the searched setting with most completion over its seeds; of equal ones
+    the first by name; without a search there is one clear line. The report names it, and that
+    with most blocks per action."""
     arms = {arm.place: arm for arm in second_study.arms()}
     method, search = arms["methods/vpg"], arms["search/vpg"]
     with pytest.raises(SettingsError, match="run the search first"):
@@ -109,10 +110,35 @@ def test_search_chooses_by_completion(tmp_path: Path):
         for seed, value in enumerate(values):
             path = place / point.name / f"seed-{seed}" / "eval.json"
             path.parent.mkdir(parents=True)
-            path.write_text(json.dumps({"completion": {"value": value}}))
+            means = {"completion": value, "action_efficiency": 0.9 - value}
+            share = {"low": 0.0, "high": 1.0, "n": 100}
+            metrics = {name: {"value": mean, **share} for name, mean in means.items()}
+            asked = {"policy": "learned", "suite": "in_distribution", "seed": 0}
+            content = {**asked, **metrics, "config": configs.to_dict(point.cfg)}
+            path.write_text(json.dumps(content | {"grasp_success": metrics["completion"]}))
     (point,) = second_study.plan_of(method, tmp_path).points
-    assert (point.cfg.learn.learning_rate, point.cfg.explore.epsilon_place) == (5e-4, (0.5, 0.0))
+    assert (point.cfg.learn.learning_rate, point.cfg.explore.epsilon_place) == (5e-4, (0.0, 0.0))
     assert (point.cfg.algo, point.cfg.train.actions, point.cfg.seed) == ("vpg", 2500, 1000)
+    archive = tmp_path / "archives" / "second-search.tar.xz"
+    second_study._write_archive(archive, "a test", place.parent, list(place.rglob("eval.json")))
+    (row,) = second_tables.searched(archive.parent)
+    names = [point.name for point in plan.points]
+    best = {"completion": f"{names[3]}: 0.567", "blocks / actions": f"{names[1]}: 0.467"}
+    assert row == {"searched": "vpg", **best}
+
+
+def test_faults_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: a damaged plan or archive ends a command with exit code 1 and one line that names
+    it."""
+    plan = tmp_path / "runs" / "replay" / "reaper-16" / files.SWEEP_PLAN
+    plan.parent.mkdir(parents=True)
+    plan.write_text("{}")
+    assert second_study.main(["status", str(tmp_path / "runs"), "--smoke"]) == 1
+    (tmp_path / "second-replay.tar.xz").write_text("no archive")
+    assert second_study.main(["report", "--archives", str(tmp_path), "--smoke"]) == 1
+    first, second = capsys.readouterr().err.splitlines()
+    assert f"{plan} cannot be read" in first
+    assert "second-replay.tar.xz is no archive of runs" in second
 
 
 @pytest.mark.slow
