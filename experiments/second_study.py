@@ -145,7 +145,7 @@ def arms() -> list[Arm]:
 def _small(part: str, name: str, more: str = "", volume: int = 16, first: int = MAIN) -> Arm:
     algo = "" if "--algo" in more else "--algo csac"
     words = f"pushes {algo} {SMALL.format(volume)} {more}"
-    return Arm(part, name, words, (first, 8), 4.8 if volume == 16 else 3.8)
+    return Arm(part, name, words, (first, 8), 4.8 if volume == 16 else 3.8, ("enclosed",))
 
 
 def _replay(name: str, volume: int) -> Arm:

@@ -51,6 +51,14 @@ def test_arms_are_those_of_the_protocol():
     assert float(total[3]) < 150.0
     assert all(arm.minutes < 9.0 and arm.seeds[0] >= 1000 for arm in second_study.arms())
     assert second_study.ABOUT.keys() == {arm.part for arm in second_study.arms()}
+    row_suites = {
+        (place, row.suite)
+        for rows in second_tables.hypotheses().values()
+        for row in rows
+        for place in (*row.ours, *row.theirs)
+    }
+    suites = {(arm.place, suite) for arm in second_study.arms() for suite in arm.suites}
+    assert row_suites <= suites  # each row of a hypothesis is measured
     numbers = {arm.part: arm.seeds[1] for arm in second_study.arms()}
     assert numbers == {row[0]: int(row[4]) for row in _table("Arms")}
     assert len({arm.place for arm in second_study.arms()}) == len(second_study.arms())
