@@ -28,7 +28,6 @@ STRATA = ("clear", "target", "packed")  # of part 2; the order decides the boots
 COMPLETION, PUSHES = "completion", "pushes_per_episode"  # of evaluations
 AREA, ACTIONS = "area", "actions to 90 %"  # of training
 POINT = 0.01  # within which methods are equal
-ALPHA = 0.05  # of Holm's test over all hypotheses together
 LAWS = {
     "uniform": "2/algo=csac,",
     "prioritised": "2/algo=csac_per,",
@@ -178,16 +177,6 @@ def actions_to_good(run: RecordedRun) -> float:
     return float(run.actions[-1]) if good is None else good
 
 
-def holm(p_values: Sequence[float], alpha: float = ALPHA) -> list[bool]:
-    """Tells which of several tests stay significant together (Holm 1979, step down)."""
-    order = np.argsort(p_values, kind="stable")
-    limits = alpha / np.arange(len(order), 0, -1)
-    passed = np.logical_and.accumulate(np.asarray(p_values)[order] <= limits)
-    survives = np.empty(len(order), bool)
-    survives[order] = passed
-    return survives.tolist()
-
-
 @functools.cache
 def differences() -> dict[tuple[str, str, str], Difference]:
     """Computes all differences that test hypotheses, by title, row and column."""
@@ -204,7 +193,7 @@ def differences() -> dict[tuple[str, str, str], Difference]:
     return {
         place: _difference(metric, statistics.difference(*strata), p, survives)
         for (place, (metric, *strata)), p, survives in zip(
-            tests.items(), p_values, holm(p_values), strict=True
+            tests.items(), p_values, statistics.holm(p_values), strict=True
         )
     }
 

@@ -160,7 +160,7 @@ def _measure(
         **asked,
         "suite": suite,
         "episodes": episodes,
-        **(library if prepared.cfg.scene.has_objects else {}),
+        **(library if any(part.cfg.scene.has_objects for part in prepared.parts.values()) else {}),
         "seconds": round(time.time() - begun, 1),
         **table,
         "config": configs.to_dict(prepared.cfg),

@@ -128,6 +128,20 @@ def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
     assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
 
 
+def test_a_policy_of_objects_in_a_suite_of_blocks(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: a policy of objects is measured in a suite of blocks, which names no library."""
+    monkeypatch.setattr(
+        rollout, "evaluate", lambda *_, **__: {**TABLE, "outcomes": {}, "counts": {}}
+    )
+    flags = ["--policy", "random", "--suite", "enclosed", "--physics", "c", "--episodes", "2"]
+    path = tmp_path / "result.json"
+    assert cli.main(["eval", "shipped_target", *flags, "--json", str(path)]) == 0
+    assert "random policy, enclosed: 2 episodes" in capsys.readouterr().out
+    assert "objects" not in json.loads(path.read_text())
+
+
 @pytest.mark.mjx
 @pytest.mark.slow
 def test_a_suite_is_the_evaluation(tmp_path: Path):

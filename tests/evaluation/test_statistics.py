@@ -1,8 +1,11 @@
 """The interquartile mean over seeds."""
 
+import functools
+
 import numpy as np
 import pytest
 import scipy.stats
+from numpy.testing import assert_allclose
 
 from csac_jax.evaluation import statistics
 
@@ -133,3 +136,33 @@ def test_area_in_closed_form():
     assert statistics.area(x, y, 500.0) == pytest.approx((100 * 0.2 + 200 * 0.4 + 200 * 0.6) / 500)
     assert statistics.area(x, y, 200.0) == pytest.approx((100 * 0.2 + 100 * 0.3) / 200)
     assert statistics.area(x[:1], y[:1], 100.0) == pytest.approx(0.2)
+
+
+def test_verdicts_by_hand():
+    """Claim: Holm's correction steps down from the smallest p; p is small where samples are apart,
+    like Welch's, and 1 where they are the same."""
+    assert statistics.holm([0.024, 0.01, 0.02, 0.9]) == [False, True, False, False]
+    assert statistics.holm([0.01, 0.012, 0.02, 0.04]) == [True] * 4
+    draws = np.random.default_rng(0)
+    ours, theirs = draws.normal(0.6, 1.0, 60), draws.normal(0.0, 1.0, 60)
+    p = statistics.p_value([ours], [theirs])
+    assert abs(np.log(p / scipy.stats.ttest_ind(ours, theirs, equal_var=False).pvalue)) < np.log(
+        10.0
+    )
+    assert statistics.p_value([ours], [ours]) > 0.9
+
+
+@pytest.mark.parametrize(("n", "worst"), [(1, 1), (4, 1), (5, 2), (8, 2), (12, 3)])
+def test_averages_of_a_band(n: int, worst: int):
+    """Claim: `band` takes another average than the interquartile mean: the mean, or that of the
+    worst quarter of seeds, rounded up; the interval is of the same bootstrap."""
+    values = np.random.default_rng(n).normal(size=n)
+    lowest = statistics.band([values], average=statistics.worst_quartile)
+    assert_allclose(lowest.value, np.mean(sorted(values)[:worst]))
+    plain = statistics.band([values], average=functools.partial(np.mean, axis=-1))
+    assert_allclose(plain.value, np.mean(values))
+    if n > 1:
+        drawn = values[np.random.default_rng(0).integers(0, n, (statistics.RESAMPLES, n))]
+        lows = [np.mean(sorted(row)[:worst]) for row in drawn]
+        assert_allclose(lowest[1:3], np.percentile(lows, [2.5, 97.5]))
+        assert_allclose(plain[1:3], np.percentile(drawn.mean(axis=1), [2.5, 97.5]))

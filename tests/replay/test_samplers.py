@@ -1,6 +1,7 @@
 """Drawn transitions against the laws by SciPy."""
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from scipy import special, stats
 from csac_jax.config import BetaReplay, OppositeReplay, PrioritisedReplay, UniformReplay
 from csac_jax.replay import ring, samplers
 from csac_jax.replay.samplers import Sampler
+from experiments import samplers as samplers_of_study
+from experiments.samplers import ReaPER, TruncatedGeometric
 from tests.sections import with_constants
 
 NUM = 20_000
@@ -350,3 +353,78 @@ def test_sampler_follows_the_schedule():
     cfg = BetaReplay(start=(1.0, 2.0), middle=(1.0, 2.0), end=(1.0, 2.0))
     for progress in np.linspace(-0.5, 1.5, 21):
         assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
+
+
+class Maps(NamedTuple):
+    """An observation of one cell."""
+
+    height: jax.Array
+
+
+class Step(NamedTuple):
+    """A transition, as far as `ReaPER` reads it."""
+
+    obs: Maps
+    next_obs: Maps
+    terminated: jax.Array
+
+
+@pytest.mark.parametrize(("added", "capacity"), [(2, 50), (30, 50), (50, 50), (83, 50)])
+def test_ages_are_truncated_geometric(added: int, capacity: int):
+    """Claim: of n stored transitions the one of age k is drawn by q^k, the newest `ratio` times as
+    often as one of age n."""
+    state = ring.init(jnp.zeros(capacity), jnp.int32(0))
+    for number in range(added):
+        state = ring.add(state, jnp.array([number]), jnp.array([True]))
+    slots, weights = drawn(TruncatedGeometric(ratio=8.0), state)
+    ages = added - 1 - np.asarray(state.items)[slots]
+    stored = min(added, capacity)
+    assert_fits(ages, 8.0 ** (-np.arange(stored) / stored))
+    assert_array_equal(weights, 1.0)
+
+
+def _episodes(rng: np.random.Generator, steps: int, scenes: int):
+    """Plays `scenes` side by side. Returns steps of `Step`, leaves [scenes], and each one's episode
+    [steps, scenes] and how it ended: 0 not, 1 terminated, 2 cut off."""
+    maps = 1 + rng.permutation(2 * steps * scenes).astype(np.int32).reshape(steps, scenes, 2)
+    maps[-1, :, 1] = 0  # as in slots that are not written yet
+    endings = rng.choice([0, 0, 1, 2], (steps, scenes))
+    episode = np.cumsum(np.pad(endings > 0, ((1, 0), (0, 0)))[:-1], axis=0)
+    played, before = [], -1 - np.arange(scenes, dtype=np.int32)
+    for ending, (fresh, after) in zip(endings, np.moveaxis(maps, 2, 1), strict=True):
+        played.append(Step(Maps(before[:, None]), Maps(after[:, None]), ending == 1))
+        before = np.where(ending > 0, fresh, after)
+    return played, episode, endings
+
+
+@pytest.mark.parametrize(("steps", "capacity"), [(1, 24), (7, 24), (8, 24), (21, 24), (20, 26)])
+def test_reliability_by_episodes(steps: int, capacity: int):
+    """Claim: R is 1 less the share of the episode's errors that follow; of one that goes on, the
+    errors up to it over the largest sum of any. Draws follow abs(error)^alpha R^omega."""
+    scenes, rng = 3, np.random.default_rng(steps)
+    played, episode, endings = _episodes(rng, steps, scenes)
+    reaper = ReaPER(scenes=scenes, actions=steps)
+    state = ring.init(reaper.init(capacity), jax.tree.map(lambda leaf: leaf[0], played[0]))
+    for step in played:
+        state = ring.add(state, jax.tree.map(jnp.asarray, step), jnp.ones(scenes, bool))
+    stored = min(steps * scenes, capacity)
+    numbers = np.arange(steps * scenes)[-stored:]  # in the order of time
+    slots, errors = numbers % capacity, rng.uniform(0.1, 2.0, steps * scenes)
+    state = reaper.update(state, jnp.asarray(slots), jnp.asarray(-errors[numbers]))
+    time, scene = numbers // scenes, numbers % scenes
+    together = (scene[:, None] == scene) & (episode[time, scene][:, None] == episode[time, scene])
+    total = together @ errors[numbers]
+    until = (together & (time <= time[:, None])) @ errors[numbers]
+    last = np.array([time[row].max() for row in together])
+    is_open = (last == steps - 1) & (endings[last, scene] != 1)
+    expected = until / np.where(is_open, total.max(), total)
+    filled = np.arange(capacity) < stored
+    found = samplers_of_study.reliability(
+        state.priority, filled, *samplers_of_study.links(state, scenes), steps
+    )
+    assert_allclose(np.asarray(found)[slots], expected, rtol=1e-5)
+    masses = np.zeros(capacity)
+    masses[slots] = errors[numbers] ** 0.3 * expected**0.3
+    cells, weights = drawn(reaper, state, progress=0.5)
+    assert_fits(cells, masses)
+    assert_allclose(weights, (masses[cells].min() / masses[cells]) ** 0.7, rtol=1e-4)
