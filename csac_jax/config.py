@@ -14,6 +14,7 @@ from csac_jax.section import ALTERNATIVES, Section, changed, number, require
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder", "object"]
 RobotKind = Literal["hand", "ur5", "ur5e"]
+TaskKind = Literal["clear", "target", "both"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
@@ -71,9 +72,15 @@ class TaskConfig(Section, section="task"):
     """Goal and length of an episode."""
 
     max_steps_without_change: ClassVar[int] = 10  # actions without visible change that end it (VPG)
-    kind: Literal["clear", "target"] = "clear"
-    """`clear`: take every block (CSAC sec. 4.2). `target`: get the marked one, again and again."""
+    kind: TaskKind = "clear"
+    """`clear`: take every block (CSAC sec. 4.2). `target`: get the marked one, again and again.
+    `both`: an episode in a fresh scene asks for either, half and half."""
     max_actions: int = number(15, 1)  # Actions after which an episode is cut off.
+
+    @property
+    def has_target(self) -> bool:
+        """Returns whether an episode may ask for one marked block."""
+        return self.kind != "clear"
 
 
 class SimConfig(Section, section="sim"):

@@ -5,8 +5,8 @@
     state = env.step(state, Action.grasp(x=0.02, y=-0.05, yaw=0.3))
 
 `reset` and `step` are pure and take one scene: vmap, jit or scan them. An episode terminates when
-no wanted block is left: any block in the task `clear`, one in the task `target`. It is truncated at
-a cap of the config's section `task`, or when physics diverges.
+no wanted block is left: any block in the task `clear`, one in the task `target`, and either in the
+task `both`. It is truncated at a cap of the config's section `task`, or when physics diverges.
 """
 
 import dataclasses
@@ -148,11 +148,12 @@ class Env:
 
     def auto_reset(self, key: jax.Array, state: State) -> State:
         """Starts the episode after `state` in a fresh scene, or in the same scene with a new target
-        after a success in the task `target`; a certified scene is none any more."""
+        after the old one was lifted; a certified scene is none any more."""
         key_scene, key_target = jax.random.split(key)
         scene = self._sample_scene(key_scene)
-        if self.cfg.task.kind == "target" and not self.cfg.scene.certified:
-            same_scene = (state.reward > 0.0) & jnp.any(state.scene.in_play)
+        if self.cfg.task.has_target:
+            one_lifted = (state.reward > 0.0) & (state.scene.target != scene_state.ANY)
+            same_scene = one_lifted & jnp.any(state.scene.in_play) & ~self._certified(state.scene)
             scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
 
@@ -206,11 +207,17 @@ class Env:
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
         """Rotates a scene at random, in a tray by quarter turns; draws the target, and fingers and
         grip where they vary."""
-        extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        any_yaw = self.any_yaw and not self.cfg.scene.tray
-        placed = scene_state.randomise_pose(key, scene, extent, any_yaw, has_target)
+        extent, any_yaw = self.cfg.heightmap.extent, self.any_yaw and not self.cfg.scene.tray
+        key_yaw, key_target = jax.random.split(key)
+        turned = scene_state.rotate_at_random(key_yaw, scene, extent, any_yaw)
+        kind, certified = self.cfg.task.kind, self._certified(scene)
+        placed = scene_state.with_target(key_target, turned, kind, certified)
         placed = scene_state.with_grip(jax.random.fold_in(key, _GRIP), placed, self.cfg.sim)
         return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
+
+    def _certified(self, scene: SceneState) -> jax.Array:
+        """Returns [] bool, the scene is a certified one of the pool."""
+        return jnp.asarray(bool(self.cfg.scene.certified))
 
     def _sample_scene(self, key: jax.Array) -> SceneState:
         key_index, key_pose = jax.random.split(key)

@@ -202,7 +202,8 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
     from csac_jax.evaluation import policies, suites
 
-    targets = {cfg.task.kind == "target"} if options.policy in policies.LEARNED else {False, True}
+    any_task = options.policy not in policies.LEARNED or cfg.task.kind == "both"
+    targets = {False, True} if any_task else {cfg.task.has_target}
     has_library = bool(options.objects or cfg.scene.objects)
     return tuple(
         name

@@ -62,7 +62,8 @@ def test_suites_are_measured_once(
 
 def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str, int]]):
     """Claim: `--suites all` leaves out suites with targets for a policy trained without, those
-    without targets for one trained with, and suites of objects where there is no library."""
+    without targets for one trained with, none of these for one trained in both tasks, and suites of
+    objects where there is no library."""
     clear, target = (policies.load_config(name) for name in ("shipped", "shipped_target"))
     options = evaluate.EvalOptions("shipped")
     of_blocks = {name for name, one in suites.SUITES.items() if not (one.target or one.objects)}
@@ -75,6 +76,8 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
         "enclosed",
         "hidden",
     )
+    both = evaluate._fitting(with_objects, clear.change(task={"kind": "both"}))
+    assert {*both} == set(suites.SUITES)
     anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 
