@@ -213,7 +213,7 @@ def endings(env: Env, last: State) -> np.ndarray:
     reasons = {
         "terminated": last.terminated,
         "physics_diverged": last.info.physics_diverged,
-        "failed_grasps": last.failed_grasps >= (env.max_failures or np.inf),
+        "failed_grasps": env.gives_up(last.scene, last.failed_grasps),
         "action_cap": last.actions >= env.cfg.task.max_actions,
     }
     numbers = map(ENDINGS.index, (*reasons, "no_change_cap"))

@@ -37,6 +37,7 @@ class SceneState:
     object_id: jax.Array | None = None  # [N] int32, number in the library; None without objects
     fingers: Fingers | None = None  # [] float32 m, the episode's; None: the gripper's own
     grip: Grip | None = None  # [] float32, the episode's; None: the gripper's own
+    certified: jax.Array | None = None  # [] bool; None: all scenes of the pool are, or none is
 
     @property
     def numbers(self) -> jax.Array:

@@ -85,12 +85,18 @@ def test_both_asks_for_all_or_for_one(env: Env):
 
 
 @pytest.mark.parametrize("own", [scene_state.ANY, 3])
-def test_certified_scene_keeps_what_it_asks_for(env: Env, own: int):
-    """Claim: in the task `both` a certified scene asks for its own target, or else for all."""
-    keys = jax.random.split(jax.random.key(3), 50)
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
-    scene, both = scene.replace(target=jnp.int32(own)), _asks_both(env, certified=("blocked",))
-    assert (jax.vmap(both.randomise_pose, (0, None))(keys, scene).target == own).all()
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_certified_scene_keeps_what_it_asks_for(env: Env, own: int, share: float):
+    """Claim: in the task `both` a certified scene asks for its own target, or else for all, also
+    among others in the pool; after a success it is replaced."""
+    both = _asks_both(env, certified=("blocked",), certified_fraction=share)
+    pool = env.scenes.replace(target=np.full(1, own, np.int32))
+    pool = pool.replace(certified=np.ones(1, bool)) if share < 1.0 else pool
+    both = dataclasses.replace(both, scenes=pool)
+    states = jax.jit(jax.vmap(both.reset))(jax.random.split(jax.random.key(3), 50))
+    assert (states.scene.target == own).all()
+    state = _got(jax.tree.map(lambda leaf: leaf[0], states))
+    assert jax.jit(both.auto_reset)(jax.random.key(4), state).scene.in_play.all()
 
 
 def test_success_without_a_target_ends_the_scene(env: Env):
