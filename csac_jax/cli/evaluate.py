@@ -155,12 +155,13 @@ def _measure(
     prepared = suites.prepare(cfg, suite, episodes, *world, policies.is_learned(policy))
     table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
     asked = {"policy": options.policy, "which": options.which, "seed": options.seed}
+    has_library = any(env.cfg.scene.has_objects for env in prepared.parts.values())
     library = {"objects": prepared.cfg.scene.objects, "split": options.split}
     return {
         **asked,
         "suite": suite,
         "episodes": episodes,
-        **(library if prepared.cfg.scene.has_objects else {}),
+        **(library if has_library else {}),
         "seconds": round(time.time() - begun, 1),
         **table,
         "config": configs.to_dict(prepared.cfg),

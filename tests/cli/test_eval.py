@@ -60,6 +60,14 @@ def test_suites_are_measured_once(
     assert [suite for suite, _ in measured[before:]] == ["cases"]
 
 
+def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a policy that was trained with objects has none in the result of a suite of blocks."""
+    monkeypatch.setattr(rollout, "evaluate", lambda *_, **__: dict(TABLE))
+    options = evaluate.EvalOptions("shipped_objects", policy="random")
+    result = evaluate._measure(lambda *_: None, options, {}, "cases", 1)
+    assert "objects" not in result
+
+
 def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str, int]]):
     """Claim: `--suites all` leaves out suites with targets for a policy trained without, those
     without targets for one trained with, none of these for one trained in both tasks, and suites of
