@@ -252,7 +252,7 @@ def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], 
     assert isinstance(policy, policies.NetworkPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
     # Inputs may be missing at the end: colours, heights, gripper and target are in this order.
-    if policy.cfg.task.kind != "target" and policy.cfg.net.colour == cfg.net.colour:
+    if not policy.cfg.task.has_target and policy.cfg.net.colour == cfg.net.colour:
         params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
         fault = "its networks are not those of these settings"

@@ -14,6 +14,7 @@ from csac_jax.section import ALTERNATIVES, Section, changed, number, require
 
 SlotKind = Literal["box", "arch", "prism", "half_cylinder", "cylinder", "object"]
 RobotKind = Literal["hand", "ur5", "ur5e"]
+TaskKind = Literal["clear", "target", "both"]
 PhysicsKind = Literal["mjx", "warp", "c", "auto"]
 SensorKind = Literal["none", "d415", "d435", "azure_kinect"]
 MESH_KINDS: tuple[SlotKind, ...] = ("prism", "half_cylinder", "cylinder")
@@ -37,6 +38,8 @@ class SceneConfig(Section, section="scene"):
     packed_fraction: float = number(0.0, 0.0, 1.0)  # Share of packed scenes, not dropped ones.
     certified: tuple[Literal["blocked", "enclosed", "tray", "hidden"], ...] = ()
     """Suites whose scenes for training are the pool, in place of dropped and packed ones."""
+    certified_fraction: float = number(1.0, 0.0, 1.0, above=True)
+    """Share of these in the pool, each as often as any other; the rest is dropped and packed."""
     size_jitter: Pair = number((0.1, 0.1), 0.0, 0.25)
     """Largest relative change of sizes: boxes and arches; meshes, 0 where `sim.physics` is warp."""
     density: Pair = number((450.0, 900.0), 100.0, 3000.0)  # Densities, kg/m^3 (ours: woods).
@@ -54,13 +57,16 @@ class SceneConfig(Section, section="scene"):
             require(low <= high, f"scene.{name}: low <= high is needed")
         if self.has_objects:
             require(self.objects != "", "scene.objects: slots of kind object need a library")
-            alike = set(self.slots) == {"object"} or self.packed_fraction == 0.0
-            require(alike, "scene.packed_fraction: must be 0 where slots hold objects and blocks")
         if self.tray:
             widest = self.drop_extent[1]
             require(self.tray >= widest, f"scene.tray: at least scene.drop_extent, {widest:g} m")
-            alike = self.packed_fraction == 0.0 or self.has_objects
+            alike = self.packed_fraction == 0.0 or set(self.slots) == {"object"}
             require(alike, "scene.packed_fraction: must be 0 for blocks in a scene.tray")
+
+    @property
+    def mixes_certified(self) -> bool:
+        """Returns whether certified scenes are a part of the pool."""
+        return bool(self.certified) and self.certified_fraction < 1.0
 
     @property
     def has_objects(self) -> bool:
@@ -72,9 +78,15 @@ class TaskConfig(Section, section="task"):
     """Goal and length of an episode."""
 
     max_steps_without_change: ClassVar[int] = 10  # actions without visible change that end it (VPG)
-    kind: Literal["clear", "target"] = "clear"
-    """`clear`: take every block (CSAC sec. 4.2). `target`: get the marked one, again and again."""
+    kind: TaskKind = "clear"
+    """`clear`: take every block (CSAC sec. 4.2). `target`: get the marked one, again and again.
+    `both`: an episode in a fresh scene asks for either, half and half."""
     max_actions: int = number(15, 1)  # Actions after which an episode is cut off.
+
+    @property
+    def has_target(self) -> bool:
+        """Returns whether an episode may ask for one marked block."""
+        return self.kind != "clear"
 
 
 class SimConfig(Section, section="sim"):
@@ -186,6 +198,7 @@ class SensorConfig(Section, section="sensor"):
     """Sigma of the focal lengths and of the optical axis, as shares of the focal length."""
     colour: float = number(0.0, 0.0, 0.5)  # Sigma of the gain of red, green and blue.
     light: float = number(0.0, 0.0, 0.5)  # Sigma of the light's direction and log brightness.
+    grey: float = number(0.0, 0.0, 1.0)  # Share of episodes in which every colour is one grey.
 
     @property
     def active(self) -> bool:

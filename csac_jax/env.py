@@ -5,8 +5,8 @@
     state = env.step(state, Action.grasp(x=0.02, y=-0.05, yaw=0.3))
 
 `reset` and `step` are pure and take one scene: vmap, jit or scan them. An episode terminates when
-no wanted block is left: any block in the task `clear`, one in the task `target`. It is truncated at
-a cap of the config's section `task`, or when physics diverges.
+no wanted block is left: any block in the task `clear`, one in the task `target`, and either in the
+task `both`. It is truncated at a cap of the config's section `task`, or when physics diverges.
 """
 
 import dataclasses
@@ -98,7 +98,7 @@ class Env:
     physics: Physics
     scenes: SceneState  # NumPy leaves [P, N, ...], at rest
     any_yaw: bool = True  # False: `reset` rotates scenes by quarter turns only
-    max_failures: int = 0  # failed grasps in a row that truncate an episode; 0: no limit
+    max_failures: int = 0  # failed grasps in a row that end an episode, see `gives_up`; 0: any
 
     __repr__ = short.text
 
@@ -142,17 +142,20 @@ class Env:
             scene = scene.replace(fingers=jax.tree.map(jnp.float32, gripper.fingers))
         if self.cfg.sim.grip_varies and scene.grip is None:
             scene = scene.replace(grip=Grip(zero, zero))
+        if self.cfg.scene.mixes_certified and scene.certified is None:
+            scene = scene.replace(certified=no)
         noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, count)
         return State(scene, obs, zero, no, no, count, count, count, info, noise_key)
 
     def auto_reset(self, key: jax.Array, state: State) -> State:
         """Starts the episode after `state` in a fresh scene, or in the same scene with a new target
-        after a success in the task `target`; a certified scene is none any more."""
+        after the old one was lifted; a certified scene is none any more."""
         key_scene, key_target = jax.random.split(key)
         scene = self._sample_scene(key_scene)
-        if self.cfg.task.kind == "target" and not self.cfg.scene.certified:
-            same_scene = (state.reward > 0.0) & jnp.any(state.scene.in_play)
+        if self.cfg.task.has_target:
+            one_lifted = (state.reward > 0.0) & (state.scene.target != scene_state.ANY)
+            same_scene = one_lifted & jnp.any(state.scene.in_play) & ~self._certified(state.scene)
             scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
 
@@ -173,7 +176,8 @@ class Env:
         valid = simulation.healthy(state.scene) & spec.height.contains(state.obs.height)
         valid &= spec.colour.contains(state.obs.colour)
         blank = scene_state.parked(self.cfg.scene.slots)
-        blank = blank.replace(fingers=state.scene.fingers, grip=state.scene.grip)
+        kept = {name: getattr(state.scene, name) for name in ("fingers", "grip", "certified")}
+        blank = blank.replace(**kept)
         return _select(valid, state.scene, blank), valid
 
     def _judge(self, state: State, action: Action, motion: Motion) -> State:
@@ -188,7 +192,7 @@ class Env:
         task = self.cfg.task
         capped = (actions >= task.max_actions) | (unchanged_steps >= task.max_steps_without_change)
         if self.max_failures:
-            capped |= failed_grasps >= self.max_failures
+            capped |= self.gives_up(scene, failed_grasps)
         success = jnp.any(motion.lifted & scene_state.is_target(motion.before))
         return State(
             scene=scene,
@@ -203,14 +207,28 @@ class Env:
             noise_key=state.noise_key,
         )
 
+    def gives_up(self, scene: SceneState, failed_grasps: jax.Array) -> jax.Array:
+        """Tests which episodes [...] end for failed grasps in a row [...]; in a pool of certified
+        and other scenes, those in certified ones."""
+        over = (failed_grasps >= self.max_failures) & (self.max_failures > 0)
+        return over if scene.certified is None else over & scene.certified
+
     def randomise_pose(self, key: jax.Array, scene: SceneState) -> SceneState:
         """Rotates a scene at random, in a tray by quarter turns; draws the target, and fingers and
         grip where they vary."""
-        extent, has_target = self.cfg.heightmap.extent, self.cfg.task.kind == "target"
-        any_yaw = self.any_yaw and not self.cfg.scene.tray
-        placed = scene_state.randomise_pose(key, scene, extent, any_yaw, has_target)
+        extent, any_yaw = self.cfg.heightmap.extent, self.any_yaw and not self.cfg.scene.tray
+        key_yaw, key_target = jax.random.split(key)
+        turned = scene_state.rotate_at_random(key_yaw, scene, extent, any_yaw)
+        kind, certified = self.cfg.task.kind, self._certified(scene)
+        placed = scene_state.with_target(key_target, turned, kind, certified)
         placed = scene_state.with_grip(jax.random.fold_in(key, _GRIP), placed, self.cfg.sim)
         return scene_state.with_fingers(jax.random.fold_in(key, _FINGERS), placed, self.gripper)
+
+    def _certified(self, scene: SceneState) -> jax.Array:
+        """Returns [] bool, the scene is a certified one of the pool."""
+        if scene.certified is None:
+            return jnp.asarray(bool(self.cfg.scene.certified))
+        return jnp.asarray(scene.certified)
 
     def _sample_scene(self, key: jax.Array) -> SceneState:
         key_index, key_pose = jax.random.split(key)
@@ -223,6 +241,8 @@ class Env:
     ) -> Observation:
         key = None if root is None else jax.random.fold_in(root, actions)
         obs = observe.observe(self.cfg, scene, key)
+        if root is not None:
+            obs = obs.replace(colour=sensor.grey(root, self.cfg.sensor, obs.colour))
         if not self.cfg.net.gripper:
             return obs
         return obs.replace(fingers=jnp.stack(scene_state.fingers(scene, self.gripper)))

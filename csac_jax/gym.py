@@ -64,7 +64,7 @@ class Interface:
             "colour": spaces.Box(0, 255, spec.colour.shape, np.uint8),
             "height": spaces.Box(0.0, spec.height.maximum, spec.height.shape, np.float32),
         }
-        if self.env.cfg.task.kind == "target":
+        if self.env.cfg.task.has_target:
             parts["target"] = spaces.Box(0, 1, spec.target.shape, np.uint8)
         if spec.fingers is not None:
             parts["fingers"] = spaces.Box(0.0, 1.0, spec.fingers.shape, np.float32)

@@ -223,6 +223,23 @@ def test_failures_end_an_episode(lab: Lab):
         assert (bool(after.truncated), bool(after.terminated)) == (stops, False)
 
 
+def test_failures_end_episodes_of_certified_scenes(lab: Lab):
+    """Claim: of a pool with certified and other scenes, failed grasps in a row end the episodes in
+    certified ones alone, in every engine. A scene that is not of the pool is none."""
+    scene = {"certified": ("blocked",), "certified_fraction": 0.5}
+    env = _in_c(lab, max_failures=2)
+    env = dataclasses.replace(env, cfg=env.cfg.change(scene=scene))
+    mjx = dataclasses.replace(env, cfg=CONFIG.change(scene=scene), physics=lab.env.physics)
+    step, action = jax.jit(env.step), Action.grasp(*BARE)
+    for certified in (None, False, True):
+        flag = None if certified is None else jnp.asarray(certified)
+        state = env.reset_to(_cube(0.0, 0.0).replace(certified=flag))
+        state = state.replace(failed_grasps=jnp.int32(1))
+        assert bool(step(state, action).truncated) == bool(certified)
+        shapes = jax.eval_shape(mjx.step, state, action)
+        assert jax.tree.structure(shapes) == jax.tree.structure(state)
+
+
 def test_oracle_clears_scenes(lab: Lab):
     """Claim: grasp by grasp a scene empties, each lift is worth 1, the last one terminates."""
     state = lab.reset(jax.random.split(jax.random.key(3), SCENES))

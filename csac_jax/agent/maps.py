@@ -43,7 +43,7 @@ class Frames:
     cell: float  # side of a cell, m
     extent: float  # side of the workspace, m
     push_length: float  # m
-    shows_target: bool  # the target task: the net sees the target's mask
+    shows_target: bool  # the net sees the target's mask
     all_cells: bool  # actions may begin on bare table
     walls: np.ndarray  # [H, W] m, height of the tray's walls; 0 elsewhere
     xy: np.ndarray  # [K, h, w, 2] m, workspace position of every cell
@@ -66,7 +66,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         cell=cell,
         extent=extent,
         push_length=cfg.sim.push_length,
-        shows_target=cfg.task.kind == "target",
+        shows_target=cfg.task.has_target,
         all_cells=cfg.policy.action_mask == "none",
         walls=_walls(cfg),
         xy=xy,

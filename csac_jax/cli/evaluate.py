@@ -155,12 +155,13 @@ def _measure(
     prepared = suites.prepare(cfg, suite, episodes, *world, policies.is_learned(policy))
     table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
     asked = {"policy": options.policy, "which": options.which, "seed": options.seed}
+    has_library = any(env.cfg.scene.has_objects for env in prepared.parts.values())
     library = {"objects": prepared.cfg.scene.objects, "split": options.split}
     return {
         **asked,
         "suite": suite,
         "episodes": episodes,
-        **(library if any(part.cfg.scene.has_objects for part in prepared.parts.values()) else {}),
+        **(library if has_library else {}),
         "seconds": round(time.time() - begun, 1),
         **table,
         "config": configs.to_dict(prepared.cfg),
@@ -202,7 +203,8 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
     from csac_jax.evaluation import policies, suites
 
-    targets = {cfg.task.kind == "target"} if options.policy in policies.LEARNED else {False, True}
+    any_task = options.policy not in policies.LEARNED or cfg.task.kind == "both"
+    targets = {False, True} if any_task else {cfg.task.has_target}
     has_library = bool(options.objects or cfg.scene.objects)
     return tuple(
         name

@@ -112,7 +112,6 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     `view` holds changes of the policy's config.
     """
     from csac_jax.evaluation import policies, rollout, suites
-    from csac_jax.io import made_for
     from csac_jax.render import episode
     from csac_jax.runtime import cache
 
@@ -123,8 +122,7 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     (env,) = prepared.parts.values()
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
-    if policies.is_learned(policy):
-        made_for.warn_if_elsewhere(policy.cfg, env.cfg)
+    policies.warn_if_elsewhere(policy, env.cfg)
     steps: list[Any] = []
     for step in rollout.episode(env, policies.in_world(policy, env.cfg), options.seed):
         steps.append(step)

@@ -58,7 +58,7 @@ def table() -> list[dict[str, Any]]:
             "task": made_for.task(cfg),
             "objects": made_for.objects(cfg),
             "hand": made_for.hand(cfg),
-            "sees": made_for.view(cfg) + ", and a mask" * (cfg.task.kind == "target"),
+            "sees": made_for.view(cfg) + ", and a mask" * cfg.task.has_target,
             **MEASURED[name]._asdict(),
         }
         for name, cfg in configs.items()

@@ -205,7 +205,7 @@ def _observed(policy: CameraPolicy, entry: Entry) -> PackedObservation:
     """Returns the policy's view of an entry's image. The mask counts in the task `target`."""
     rgb, depth, lens, pose, mask = entry.image
     try:
-        marked = mask if policy.cfg.task.kind == "target" else None
+        marked = mask if policy.cfg.task.has_target else None
         obs = policy.observe(rgb, depth, lens, pose, marked)
     except (SettingsError, FailedError) as error:
         raise SettingsError(f"{entry.path}: {error}") from None

@@ -50,7 +50,7 @@ def serialize(cfg: Config, params: Params) -> bytes:
 def _decide(cfg: Config, params: Params) -> Callable[..., tuple[jax.Array, ...]]:
     """Returns the policy as a function of maps, in operations that jax2onnx knows: no vmap of a
     gather, no window of bools."""
-    frames, has_target = actor_critic.make(cfg).frames, cfg.task.kind == "target"
+    frames, has_target = actor_critic.make(cfg).frames, cfg.task.has_target
     unmasked = cfg.change(policy={"action_mask": "none"})
     rule = policy.PRIMITIVE_RULES[cfg.policy.primitive]
 

@@ -34,7 +34,7 @@ def map_shapes(cfg: Config) -> tuple[Any, ...]:
     """Returns the shapes of the arguments of `from_maps`."""
     rows = (cfg.heightmap.size,) * 2
     shapes = _ARRAY((*rows, 3), np.float32), _ARRAY(rows, np.float32), _ARRAY(rows, np.bool_)
-    return shapes if cfg.task.kind == "target" else shapes[:2]
+    return shapes if cfg.task.has_target else shapes[:2]
 
 
 def from_maps(cfg: Config, params: Params) -> tuple[Callable[..., Outputs], tuple[Any, ...]]:
@@ -67,7 +67,7 @@ def from_image(
     rows = size[::-1]
     floats = [_ARRAY(shape, np.float32) for shape in (rows, (4,), (4, 4))]
     shapes = _ARRAY((*rows, 3), np.uint8), *floats, _ARRAY(rows, np.bool_)
-    return decide, shapes if cfg.task.kind == "target" else shapes[:4]
+    return decide, shapes if cfg.task.has_target else shapes[:4]
 
 
 def _points(depth: jax.Array, lens: jax.Array, pose: jax.Array) -> jax.Array:
@@ -80,7 +80,7 @@ def _points(depth: jax.Array, lens: jax.Array, pose: jax.Array) -> jax.Array:
 
 
 def _outputs(cfg: Config, params: Params, obs: Observation) -> Outputs:
-    state = decision.dense_maps(cfg, params, obs, cfg.task.kind == "target")
+    state = decision.dense_maps(cfg, params, obs, cfg.task.has_target)
     choice, _ = decision.choose(cfg, state, obs.height)
     action = choice.action
     return action.primitive, action.pose, choice.score, choice.valid, choice.stations

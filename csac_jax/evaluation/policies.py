@@ -17,7 +17,7 @@ from csac_jax.config import Config
 from csac_jax.constants import Primitive
 from csac_jax.env import State
 from csac_jax.errors import SettingsError
-from csac_jax.io import checkpoint, files, policy_file
+from csac_jax.io import checkpoint, files, made_for, policy_file
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import modules, short
@@ -227,13 +227,22 @@ def is_learned(policy: Policy) -> bool:
     return isinstance(policy, NetworkPolicy)
 
 
+def warn_if_elsewhere(policy: Policy, cfg: Config) -> None:
+    """Warns of networks in a world that they were not trained in; `both` knows either task."""
+    if is_learned(policy):
+        kind = cfg.task.kind if policy.cfg.task.kind == "both" else policy.cfg.task.kind
+        made_for.warn_if_elsewhere(policy.cfg.change(task={"kind": kind}), cfg)
+
+
 def in_world(policy: Policy, cfg: Config) -> Policy:
-    """Gives a policy the config of an environment; a custom policy stays as it is."""
+    """Gives a policy the config of an environment, of which networks keep the task that they were
+    trained for: it decides if they see a mask. A custom policy stays as it is."""
     if isinstance(policy, PlannerPolicy) and policy.proposer is not None:
-        proposer = policy.proposer.replace(cfg=cfg)
-        return policy.replace(cfg=cfg, proposer=proposer)
+        return policy.replace(cfg=cfg, proposer=in_world(policy.proposer, cfg))
+    if isinstance(policy, NetworkPolicy):
+        return policy.replace(cfg=cfg.change(task={"kind": policy.cfg.task.kind}))
     baselines = RandomPolicy | GeometricPolicy | OraclePolicy | PlannerPolicy
-    ours = NetworkPolicy | CustomLearnerPolicy | baselines
+    ours = CustomLearnerPolicy | baselines
     return dataclasses.replace(policy, cfg=cfg) if isinstance(policy, ours) else policy
 
 

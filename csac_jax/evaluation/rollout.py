@@ -16,7 +16,6 @@ from csac_jax.env import Env, State
 from csac_jax.evaluation import metrics, policies, suites
 from csac_jax.evaluation.metrics import ENDINGS, Episodes
 from csac_jax.evaluation.policies import NetworkPolicy, Policy, PolicyDebug
-from csac_jax.io import made_for
 from csac_jax.objects.library import Split
 from csac_jax.robot import primitives
 from csac_jax.runtime import compiler
@@ -54,8 +53,7 @@ def evaluate(
         )
     tables = {}
     for name, env in suite.parts.items():
-        if policies.is_learned(policy):
-            made_for.warn_if_elsewhere(policy.cfg, env.cfg)
+        policies.warn_if_elsewhere(policy, env.cfg)
         actor = policies.in_world(policy, env.cfg)
         count = functools.partial(on_progress, name) if on_progress else None
         ended = rollout(env, actor, suite.episodes, suite.seed, count)
@@ -215,7 +213,7 @@ def endings(env: Env, last: State) -> np.ndarray:
     reasons = {
         "terminated": last.terminated,
         "physics_diverged": last.info.physics_diverged,
-        "failed_grasps": last.failed_grasps >= (env.max_failures or np.inf),
+        "failed_grasps": env.gives_up(last.scene, last.failed_grasps),
         "action_cap": last.actions >= env.cfg.task.max_actions,
     }
     numbers = map(ENDINGS.index, (*reasons, "no_change_cap"))

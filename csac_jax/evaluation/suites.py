@@ -48,6 +48,7 @@ from csac_jax.config import (
     SensorKind,
     SimConfig,
     SlotKind,
+    TaskKind,
 )
 from csac_jax.constants import RENAMED_SUITES
 from csac_jax.env import MAX_FAILURES, Env
@@ -57,7 +58,7 @@ from csac_jax.runtime import short
 from csac_jax.scenes import arrange, cases, certify, constructions, pool
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
-from csac_jax.world import model, object_slots
+from csac_jax.world import model, object_slots, scene_state
 from csac_jax.world.scene_state import SceneState
 
 IN_DISTRIBUTION = "in_distribution"
@@ -137,12 +138,13 @@ def prepare(
     cfg = cfg.change(sim=backend.resolve(few).sim)  # `auto`: what suits a few scenes at a time
     if suite not in SUITES:
         parts: Any = {path.stem: _case(cfg, path) for path in _case_files(Path(suite))}
-    elif SUITES[suite].target and learned and cfg.task.kind != "target":
+    elif SUITES[suite].target and learned and not cfg.task.has_target:
         raise SettingsError(
             f"suite: {suite} needs a policy trained with task.kind target, this one was trained to "
             "clear the table; choose another suite, or the policy oracle or random"
         )
     else:
+        cfg = _with_suite_task(cfg, SUITES[suite].target)
         parts = SUITES[suite].build(cfg, episodes, 1 + seed)
     parts = parts if isinstance(parts, dict) else {suite: parts}
     return PreparedSuite(suite, cfg, parts, episodes, seed)
@@ -157,6 +159,12 @@ def check(suite: str) -> None:
         raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
     if not _case_files(Path(suite)):
         raise SettingsError(f"suite: {suite} holds no case file, NAME.json")
+
+
+def _with_suite_task(cfg: Config, target: bool) -> Config:
+    """Chooses the task of a suite for policies that were trained in both."""
+    kind: TaskKind = "target" if target else "clear"
+    return cfg.change(task={"kind": kind}) if cfg.task.kind == "both" else cfg
 
 
 def _case_files(path: Path) -> list[Path]:
@@ -213,6 +221,7 @@ def _pool(scene: SceneState) -> SceneState:
 def _case(cfg: Config, path: Path) -> Env:
     try:
         case = cases.load(path, cfg.heightmap.extent)
+        cfg = _with_suite_task(cfg, bool(case.scene.target != scene_state.ANY))
         if cfg.task.kind == "target":
             cases.require_target(case)
     except ValueError as error:

@@ -6,7 +6,7 @@ from csac_jax import grippers
 from csac_jax.config import Config
 from csac_jax.errors import DataWarning
 
-TASKS = {"clear": "take all", "target": "get a marked one"}
+TASKS = {"clear": "take all", "target": "get a marked one", "both": "take all, or get a marked one"}
 ABOVE = "exact maps from above"
 
 
@@ -17,7 +17,10 @@ def task(cfg: Config) -> str:
 
 def objects(cfg: Config) -> str:
     """Returns what lies in the scenes of a config."""
-    return "objects of many shapes" if cfg.scene.has_objects else "blocks"
+    some = "objects of many shapes"
+    if not cfg.scene.has_objects:
+        return "blocks"
+    return some if set(cfg.scene.slots) == {"object"} else f"blocks and {some}"
 
 
 def hand(cfg: Config) -> str:

@@ -86,7 +86,10 @@ def seat(case: Case, slots: tuple[SlotKind, ...]) -> SceneState:
         leaf[list(seats.values())] = placed[used]
         return leaf
 
-    return jax.tree.map(put, scene_state.parked(slots), case.scene)
+    parked, scene = scene_state.parked(slots), case.scene
+    if scene.object_id is None and parked.object_id is not None:
+        scene = scene.replace(object_id=np.zeros(len(case.slots), np.int32))
+    return jax.tree.map(put, parked, scene)
 
 
 def _case(content: "CaseFile", folder: Path) -> Case:

@@ -23,7 +23,7 @@ import numpy as np
 
 from csac_jax import cache_folder
 from csac_jax.assets import assets
-from csac_jax.config import Config, SceneConfig
+from csac_jax.config import Config, SceneConfig, SlotKind
 from csac_jax.errors import SceneError, SettingsError
 from csac_jax.scenes import arrange, cases, certify, constructions, packings
 from csac_jax.world import blocks, model, object_slots, scene_state
@@ -49,25 +49,64 @@ Fall = Callable[[SceneState, BlockFields], SceneState | None]
 def scenes(cfg: Config, stream: int, count: int | None = None) -> SceneState:
     """Returns at least `count` scenes at rest, as many of each number of blocks, [P, N, ...].
 
-    The last `scene.packed_fraction` of them are arrangements, or objects side by side in the
-    largest square of `scene.drop_extent`. Without a count, `scene.pool` of each number of blocks.
-    With `scene.certified` all certified scenes for training of these suites, whatever the count.
+    The last `scene.packed_fraction` of them are arrangements of the blocks, without the objects; or
+    of objects alone, side by side in the largest square of `scene.drop_extent`. Without a count,
+    `scene.pool` of each number of blocks. With `scene.certified` all certified scenes for training
+    of these suites, whatever the count; or of TRAIN_STREAM the last `scene.certified_fraction`, of
+    other streams none.
     Raises SceneError for blocks that do not come to rest or allow no arrangement.
     """
-    if cfg.scene.certified:
-        return _certified(cfg.scene)
     block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     number = cfg.scene.pool if count is None else -(-count // block_counts)
+    if not cfg.scene.certified:
+        return _uncertified(cfg, stream, number)
+    if not cfg.scene.mixes_certified:
+        return _certified(cfg.scene)
+    share = cfg.scene.certified_fraction if stream == TRAIN_STREAM else 0.0
+    certified = min(round(share * number), number - 1)
+    others = _flagged(_uncertified(cfg, stream, number - certified), False)
+    known, wanted = _certified(cfg.scene), certified * block_counts
+    rows = np.arange(wanted) * len(known.target) // max(wanted, 1)
+    some = _flagged(jax.tree.map(lambda leaf: leaf[rows], known), True)
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), others, some)
+
+
+def _flagged(scenes: SceneState, certified: bool) -> SceneState:
+    return scenes.replace(certified=np.full(len(scenes.target), certified))
+
+
+def _uncertified(cfg: Config, stream: int, number: int) -> SceneState:
+    """Returns dropped and packed scenes, `number` of each number of blocks."""
+    block_counts = 1 + len(cfg.scene.slots) - cfg.scene.min_blocks
     arranged = round(cfg.scene.packed_fraction * number)
     parts = [settled(cfg, stream, number - arranged)] if arranged < number else []
-    if arranged and cfg.scene.has_objects:
+    if arranged and set(cfg.scene.slots) == {"object"}:
         widest = cfg.change(scene={"drop_extent": (cfg.scene.drop_extent[1],) * 2})
         parts.append(settled(widest, stream, arranged, packed=True))
     elif arranged:
-        drawn = (cfg.scene, cfg.heightmap.extent, stream, arranged * block_counts)
-        name = _digest(cfg, stream, drawn[-1], "arranged")
-        parts.append(_stored(name, lambda: arrange.arrangements(*drawn)))
+        parts.append(_arranged(cfg, stream, arranged * block_counts))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def _arranged(cfg: Config, stream: int, count: int) -> SceneState:
+    """Returns packed arrangements of the blocks, [count, N, ...], the objects parked."""
+    slots, least = cfg.scene.slots, cfg.scene.min_blocks
+    alone: tuple[SlotKind, ...] = tuple(kind for kind in slots if kind != "object")
+    if alone != slots:
+        own = {"slots": alone, "min_blocks": min(least, len(alone)), "objects": ""}
+        cfg = cfg.change(scene=own)
+    drawn = (cfg.scene, cfg.heightmap.extent, stream, count)
+    name = _digest(cfg, stream, count, "arranged")
+    scenes = _stored(name, lambda: arrange.arrangements(*drawn))
+    return scenes if alone == slots else _stack(_seated("packed", alone, scenes, slots))
+
+
+def _seated(
+    name: str, own: tuple[SlotKind, ...], scenes: SceneState, slots: tuple[SlotKind, ...]
+) -> list[SceneState]:
+    """Moves scenes [P, N, ...] with slots of their own to other ones, see `cases.seat`."""
+    rows = [jax.tree.map(lambda leaf, i=i: leaf[i], scenes) for i in range(len(scenes.target))]
+    return [cases.seat(cases.Case(name, own, row), slots) for row in rows]
 
 
 def _certified(cfg: SceneConfig) -> SceneState:
@@ -81,8 +120,7 @@ def _certified(cfg: SceneConfig) -> SceneState:
         if suite.tray != cfg.tray:
             raise SettingsError(f"scene.tray: scenes of {name} need {suite.tray:g}")
         scenes = certify.load(certify.shipped(f"{name}-train")).scenes
-        rows = [jax.tree.map(lambda leaf, i=i: leaf[i], scenes) for i in range(len(scenes.target))]
-        seated += [cases.seat(cases.Case(name, suite.slots, row), cfg.slots) for row in rows]
+        seated += _seated(name, suite.slots, scenes, cfg.slots)
     return _stack(seated)
 
 
@@ -305,7 +343,7 @@ def _digest(cfg: Config, stream: int, count: int, *how: str) -> str:
     numbers = (float(cfg.heightmap.extent), stream, count, cfg.sim.timestep)
     if scene.has_objects:  # the content of a library counts, not its place
         scene = dataclasses.replace(scene, objects=object_slots.library(scene).sha256)
-    drawn = {name: value for name, value in vars(scene).items() if name != "certified"}
+    drawn = {name: value for name, value in vars(scene).items() if not name.startswith("certified")}
     settings = repr((_VERSION, mujoco.__version__, drawn, *numbers, *how))
     content = hashlib.sha256(settings.encode())
     code = [arrange.__file__, packings.__file__] if "arranged" in how else []

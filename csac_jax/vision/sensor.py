@@ -14,6 +14,7 @@ from csac_jax.config import CameraConfig, SensorConfig
 from csac_jax.vision import camera, depth_camera
 from csac_jax.vision.camera import Camera
 
+GREY = 0.5  # level of a view without colours (ours), which the small net takes as 0
 _OWN = np.uint32(2**31)  # distinct from a key's children by `split`
 _SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
@@ -99,6 +100,17 @@ def light(key: jax.Array, cfg: SensorConfig) -> jax.Array:
     """Draws the unit vector [3] towards the light: that of `camera.shade`, turned a little."""
     towards = jnp.asarray(camera.LIGHT, jnp.float32) + cfg.light * jax.random.normal(key, (3,))
     return towards / jnp.sqrt(jnp.sum(towards**2))
+
+
+def grey(root: jax.Array, cfg: SensorConfig, colour: jax.Array) -> jax.Array:
+    """Replaces colours [H, W, 3] by GREY in all views of a share `cfg.grey` of episodes.
+
+    Args: root, of the episode, see `episode_key`.
+    """
+    if cfg.grey == 0.0:
+        return colour
+    dropped = jax.random.bernoulli(jax.random.fold_in(root, _OWN), cfg.grey)
+    return jnp.where(dropped, jnp.full_like(colour, GREY), colour)
 
 
 def colour(key: jax.Array, cfg: SensorConfig, exact: jax.Array) -> jax.Array:

@@ -8,7 +8,7 @@ import numpy as np
 from flax import struct
 
 from csac_jax import geometry
-from csac_jax.config import SimConfig, SlotKind
+from csac_jax.config import SimConfig, SlotKind, TaskKind
 from csac_jax.grippers import Fingers, Grip, Gripper
 from csac_jax.world import blocks
 
@@ -37,6 +37,7 @@ class SceneState:
     object_id: jax.Array | None = None  # [N] int32, number in the library; None without objects
     fingers: Fingers | None = None  # [] float32 m, the episode's; None: the gripper's own
     grip: Grip | None = None  # [] float32, the episode's; None: the gripper's own
+    certified: jax.Array | None = None  # [] bool; None: all scenes of the pool are, or none is
 
     @property
     def numbers(self) -> jax.Array:
@@ -117,6 +118,22 @@ def mark_target(key: jax.Array, scene: SceneState) -> SceneState:
     return scene.replace(target=jnp.where(jnp.any(scene.in_play), slot, ANY))
 
 
+def with_target(
+    key: jax.Array, scene: SceneState, kind: TaskKind, certified: jax.Array | bool
+) -> SceneState:
+    """Marks what an episode of a task asks for; except in `clear`, a scene keeps its own target.
+
+    In the task `both`, a `certified` scene without a target gets none, another with half a chance.
+    """
+    if kind == "clear":
+        return scene.replace(target=jnp.full_like(scene.target, ANY))
+    drawn = mark_target(key, scene).target
+    if kind == "both":
+        one = jax.random.bernoulli(jax.random.fold_in(key, 1)) & ~jnp.asarray(certified)
+        drawn = jnp.where(one, drawn, ANY)
+    return scene.replace(target=jnp.where(scene.target == ANY, drawn, scene.target))
+
+
 def is_target(scene: SceneState) -> jax.Array:
     """Returns [N] bool, slots of the blocks that the task asks for."""
     return (scene.target == ANY) | (np.arange(len(scene.in_play)) == scene.target)
@@ -127,20 +144,13 @@ def inside(position: jax.Array, extent: float) -> jax.Array:
     return jnp.all(jnp.abs(position[:, :2]) <= 0.5 * extent, axis=1)
 
 
-def randomise_pose(
-    key: jax.Array, scene: SceneState, extent: float, any_yaw: bool, has_target: bool
-) -> SceneState:
-    """Rotates a scene by a random yaw; with `has_target` it keeps its target or gets one.
+def rotate_at_random(key: jax.Array, scene: SceneState, extent: float, any_yaw: bool) -> SceneState:
+    """Rotates a scene by a random yaw.
 
     Without `any_yaw`, or where a block would leave the square of `extent` m, by quarter turns.
     """
-    key_yaw, key_target = jax.random.split(key)
-    yaw = jax.random.uniform(key_yaw, (), maxval=2.0 * np.pi)
+    yaw = jax.random.uniform(key, (), maxval=2.0 * np.pi)
     near = jnp.linalg.norm(scene.position[:, :2], axis=1) <= 0.5 * extent
     free = any_yaw & jnp.all(near | ~scene.in_play)
     quarters = jnp.round(yaw / (0.5 * np.pi)) * (0.5 * np.pi)
-    rotated = rotate(scene, jnp.where(free, yaw, quarters))
-    if not has_target:
-        return rotated.replace(target=jnp.full_like(scene.target, ANY))
-    marked = mark_target(key_target, rotated)
-    return marked.replace(target=jnp.where(scene.target == ANY, marked.target, scene.target))
+    return rotate(scene, jnp.where(free, yaw, quarters))

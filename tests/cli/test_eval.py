@@ -60,9 +60,18 @@ def test_suites_are_measured_once(
     assert [suite for suite, _ in measured[before:]] == ["cases"]
 
 
+def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a policy that was trained with objects has none in the result of a suite of blocks."""
+    monkeypatch.setattr(rollout, "evaluate", lambda *_, **__: dict(TABLE))
+    options = evaluate.EvalOptions("shipped_objects", policy="random")
+    result = evaluate._measure(lambda *_: None, options, {}, "cases", 1)
+    assert "objects" not in result
+
+
 def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str, int]]):
     """Claim: `--suites all` leaves out suites with targets for a policy trained without, those
-    without targets for one trained with, and suites of objects where there is no library."""
+    without targets for one trained with, none of these for one trained in both tasks, and suites of
+    objects where there is no library."""
     clear, target = (policies.load_config(name) for name in ("shipped", "shipped_target"))
     options = evaluate.EvalOptions("shipped")
     of_blocks = {name for name, one in suites.SUITES.items() if not (one.target or one.objects)}
@@ -75,6 +84,8 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
         "enclosed",
         "hidden",
     )
+    both = evaluate._fitting(with_objects, clear.change(task={"kind": "both"}))
+    assert {*both} == set(suites.SUITES)
     anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 
@@ -126,20 +137,6 @@ def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
     printed = capsys.readouterr().out
     assert "objects that stayed most often, of 20" in " ".join(printed.split())
     assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
-
-
-def test_a_policy_of_objects_in_a_suite_of_blocks(
-    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-):
-    """Claim: a policy of objects is measured in a suite of blocks, which names no library."""
-    monkeypatch.setattr(
-        rollout, "evaluate", lambda *_, **__: {**TABLE, "outcomes": {}, "counts": {}}
-    )
-    flags = ["--policy", "random", "--suite", "enclosed", "--physics", "c", "--episodes", "2"]
-    path = tmp_path / "result.json"
-    assert cli.main(["eval", "shipped_target", *flags, "--json", str(path)]) == 0
-    assert "random policy, enclosed: 2 episodes" in capsys.readouterr().out
-    assert "objects" not in json.loads(path.read_text())
 
 
 @pytest.mark.mjx

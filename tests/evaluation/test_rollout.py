@@ -16,7 +16,7 @@ from csac_jax.agent import actor_critic
 from csac_jax.config import TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
-from csac_jax.evaluation import rollout, suites
+from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.evaluation.metrics import Episodes
 from csac_jax.evaluation.policies import NetworkPolicy, OraclePolicy, RandomPolicy
 from csac_jax.robot.primitives import Action
@@ -307,3 +307,12 @@ def test_policies_say_what_they_were_not_made_for(
     lines = [str(warning.message) for warning in caught]
     assert len(lines) == (text is not None)
     assert all(text in line and "\n" not in line for line in lines)
+
+
+@pytest.mark.parametrize("kind", ["clear", "target"])
+def test_policies_of_both_tasks_know_either(kind: str):
+    """Claim: nothing warns of the task of a policy that was trained in both."""
+    cfg = presets.quick().change(sim={"physics": "auto"}, task={"kind": "both"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(task={"kind": kind}))

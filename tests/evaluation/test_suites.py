@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
+from csac_jax.agent import actor_critic
 from csac_jax.config import Config, SensorConfig
-from csac_jax.evaluation import rollout, suites
+from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.scenes import cases, pool
 from csac_jax.world import scene_state
 
@@ -109,6 +110,24 @@ def test_packed_scenes_follow_the_seed():
     assert len({scene.tobytes() for scene in (*first.position, *other.position)}) == 60
     in_play = first.in_play.sum(axis=1)
     assert in_play[20:].mean() > in_play[:10].mean()
+
+
+def test_suites_ask_policies_of_both_tasks_for_theirs(tmp_path: Path):
+    """Claim: a policy that was trained in both tasks gets the task of the suite: a target where the
+    suite or the user's case marks one, else all blocks. Its networks see the mask in either."""
+    both = CFG.change(task={"kind": "both"})
+    path = tmp_path / "mine.json"
+    path.write_text(cases.shipped("hole").read_text())
+    for suite, kind in (("cases", "clear"), ("enclosed", "target"), (str(path), "target")):
+        prepared = suites.prepare(both, suite, EPISODES, 0)
+        env = next(iter(prepared.parts.values()))
+        assert env.cfg.task.kind == kind
+        networks = policies.in_world(policies.NetworkPolicy(both, None), env.cfg)
+        assert networks.cfg == env.cfg.change(task={"kind": "both"})
+        assert actor_critic.make(networks.cfg).frames.shows_target
+        planner = policies.PlannerPolicy(both, policies.NetworkPolicy(both, None))
+        assert policies.in_world(planner, env.cfg).proposer.cfg == networks.cfg
+    assert suites.prepare(both, "in_distribution", EPISODES, 0).cfg.task.kind == "clear"
 
 
 def test_users_case_file(tmp_path: Path):

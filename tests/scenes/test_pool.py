@@ -290,6 +290,48 @@ def test_certified_scenes_are_the_pool():
     assert make_env(cfg).max_failures == MAX_FAILURES
 
 
+def test_certified_scenes_are_a_share_of_the_pool(cache: Path):
+    """Claim: with `scene.certified_fraction` certified scenes are that share of the pool, each as
+    often as any other, and known by a flag; the rest is what the pool would be without them. Only
+    training has them."""
+    certified = {"certified": ("enclosed", "blocked"), "certified_fraction": 0.99}
+    slots = {"slots": ("box",) * 5 + ("arch",) * 2, "min_blocks": 7}
+    cfg = presets.get("pushes").change(scene=slots | certified, sim={"physics": "c"})
+    mixed = pool.scenes(cfg, pool.TRAIN_STREAM, 1000)
+    np.testing.assert_array_equal(mixed.certified, np.arange(1000) >= 10)
+    rest = pool.scenes(cfg.change(scene={"certified": ()}), pool.TRAIN_STREAM, 10)
+    stored = pool.scenes(cfg.change(scene={"certified_fraction": 1.0}), pool.TRAIN_STREAM)
+    assert rest.certified is stored.certified is None
+    np.testing.assert_array_equal(mixed.position[:10], rest.position)
+    rows = [scene.tobytes() for scene in mixed.position[10:]]
+    numbers = [rows.count(scene.tobytes()) for scene in stored.position]
+    assert (min(numbers), max(numbers), sum(numbers)) == (1, 2, 990)
+    assert set(mixed.target[mixed.certified] == scene_state.ANY) == {True, False}
+    assert not pool.scenes(cfg, 1, 5).certified.any()
+
+
+def test_blocks_and_objects_share_a_pool(cache: Path):
+    """Claim: among slots of blocks and of objects, dropped scenes hold both; packed and certified
+    ones are those of the blocks alone, and their objects are parked."""
+    slots = ("object", "box", "box", "arch", "object", *("box",) * 4)
+    mixed = {"slots": slots, "min_blocks": 9, "objects": "procedural:0:12"}
+    shares = {"certified": ("enclosed",), "certified_fraction": 0.25, "packed_fraction": 0.5}
+    scene = mixed | shares | {"drop_extent": (0.2, 0.3)}
+    cfg = presets.get("pushes").change(scene=scene, sim={"physics": "c"})
+    scenes = pool.scenes(cfg, pool.TRAIN_STREAM, 8)
+    is_block = ~blocks.is_object(slots)
+    np.testing.assert_array_equal(scenes.in_play[:, ~is_block].all(axis=1), np.arange(8) < 3)
+    assert not scenes.in_play[3:, ~is_block].any()
+    assert len(np.unique(scenes.object_id[:3, ~is_block])) > 3
+    alone = {"slots": tuple(np.array(slots)[is_block]), "min_blocks": 7, "objects": ""}
+    packed = pool.scenes(cfg.change(scene=alone | {"certified": (), "packed_fraction": 1.0}), 0, 3)
+    for ours, theirs in zip(range(3, 6), range(3), strict=True):
+        places = [s.position[i][s.in_play[i]] for s, i in ((scenes, ours), (packed, theirs))]
+        np.testing.assert_array_equal(*(np.sort(place, axis=0) for place in places))
+        marked = (s.position[i][s.target[i]] for s, i in ((scenes, ours), (packed, theirs)))
+        np.testing.assert_array_equal(*marked)
+
+
 @pytest.mark.parametrize(
     ("scene", "line"),
     [

@@ -68,11 +68,9 @@ def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
 
 
 def test_objects_need_a_library():
-    """Claim: objects without a library, and packed scenes of both kinds, are refused by setting."""
+    """Claim: objects without a library are refused by setting."""
     with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
         dataclasses.replace(CONFIG.scene, objects="")
-    with pytest.raises(ValueError, match=r"scene\.packed_fraction: must be 0"):
-        CONFIG.change(scene={"slots": ("box", "object"), "min_blocks": 2, "packed_fraction": 0.5})
 
 
 def _grasp(env: Env, scene: SceneState) -> tuple:

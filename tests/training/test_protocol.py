@@ -1,5 +1,8 @@
 """The paper's protocol, sec. 4.3: targets of one scene, one after the other."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,6 +61,57 @@ def test_target_is_named_at_random(env: Env):
     scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
     first = jax.jit(jax.vmap(lambda key: env.randomise_pose(key, scene).target))(keys)
     assert stats.chisquare(np.bincount(np.asarray(first), minlength=BLOCKS)).pvalue > 1e-3
+
+
+def _asks_both(env: Env, **scene: Any) -> Env:
+    return dataclasses.replace(env, cfg=env.cfg.change(task={"kind": "both"}, scene=scene))
+
+
+def test_both_asks_for_all_or_for_one(env: Env):
+    """Claim: in the task `both` half of the fresh scenes ask for one block, any with the same
+    chance; the others ask for all, and show a mask of ones."""
+    keys = jax.random.split(jax.random.key(2), 2000)
+    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
+    both = _asks_both(env)
+    draw = jax.jit(jax.vmap(lambda key: both.randomise_pose(key, scene).target))
+    targets = np.asarray(draw(keys))
+    marked = targets[targets != scene_state.ANY]
+    assert stats.binomtest(len(marked), len(targets)).pvalue > 1e-3
+    assert stats.chisquare(np.bincount(marked, minlength=BLOCKS)).pvalue > 1e-3
+    reset = jax.jit(both.reset)
+    for number in range(10):
+        state = reset(jax.random.key(number))
+        assert state.obs.target.all() == (state.scene.target == scene_state.ANY)
+
+
+@pytest.mark.parametrize("own", [scene_state.ANY, 3])
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_certified_scene_keeps_what_it_asks_for(env: Env, own: int, share: float):
+    """Claim: in the task `both` a certified scene asks for its own target, or else for all, also
+    among others in the pool; after a success it is replaced."""
+    both = _asks_both(env, certified=("blocked",), certified_fraction=share)
+    pool = env.scenes.replace(target=np.full(1, own, np.int32))
+    pool = pool.replace(certified=np.ones(1, bool)) if share < 1.0 else pool
+    both = dataclasses.replace(both, scenes=pool)
+    states = jax.jit(jax.vmap(both.reset))(jax.random.split(jax.random.key(3), 50))
+    assert (states.scene.target == own).all()
+    state = _got(jax.tree.map(lambda leaf: leaf[0], states))
+    assert jax.jit(both.auto_reset)(jax.random.key(4), state).scene.in_play.all()
+
+
+def test_success_without_a_target_ends_the_scene(env: Env):
+    """Claim: in the task `both` a scene goes on after the success of an episode with a target, and
+    gets a new one; after one that asked for all it is replaced."""
+    both = _asks_both(env)
+    reset, following = jax.jit(both.reset), jax.jit(both.auto_reset)
+    states = [_got(reset(jax.random.key(number))) for number in range(8)]
+    assert {int(state.scene.target) == scene_state.ANY for state in states} == {True, False}
+    for state in states:
+        state = state.replace(scene=scene_state.park(state.scene, jnp.arange(BLOCKS) != 1))
+        after = following(jax.random.key(4), state)
+        left = BLOCKS if state.scene.target == scene_state.ANY else state.scene.in_play.sum()
+        assert after.scene.in_play.sum() == left
+        assert left == BLOCKS or after.scene.target != scene_state.ANY
 
 
 def test_failure_replaces_the_scene(env: Env):

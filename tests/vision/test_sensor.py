@@ -158,6 +158,24 @@ def test_orthographic_errors():
 
 
 @pytest.mark.mjx
+@pytest.mark.parametrize("view", [SMALL, pytest.param(OBLIQUE, marks=pytest.mark.slow)])
+def test_colours_are_dropped_for_whole_episodes(view):
+    """Claim: in the stated share of episodes every colour of every view is one grey; heights, and
+    the colours of other episodes, are as they were."""
+    env = _env(heightmap=view, sensor=SensorConfig(grey=0.3))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(6), 300))
+    later = jax.jit(jax.vmap(env.step, (0, None)))(states, _PUSH)
+    true = jax.jit(jax.vmap(lambda scene: observe.observe(env.cfg, scene)))(states.scene)
+    grey = [(np.asarray(each.obs.colour) == sensor.GREY).all((1, 2, 3)) for each in (states, later)]
+    np.testing.assert_array_equal(*grey)
+    assert 0.2 < grey[0].mean() < 0.4
+    np.testing.assert_allclose(states.obs.height, true.height, atol=1e-6)
+    np.testing.assert_array_equal(states.obs.colour[~grey[0]], true.colour[~grey[0]])
+    every = _env(heightmap=view, sensor=SensorConfig(grey=1.0)).reset(jax.random.key(0))
+    assert (every.obs.colour == sensor.GREY).all()
+
+
+@pytest.mark.mjx
 def test_without_errors_there_is_no_randomness():
     """Claim: by default a state carries no key and the compiled view draws no random numbers; a
     reset with noise but without a key says so."""
