@@ -68,7 +68,7 @@ def _step(
     info = {"cleared": cleared, "blocks_lost": blocks_lost, "physics_diverged": np.bool_(diverged)}
     counts = {"actions": np.int32(actions), "failed_grasps": np.int32(failed)}
     after = {"info": SimpleNamespace(**info), "terminated": np.bool_(terminated), **counts}
-    scene = SimpleNamespace(target=target, object_id=objects)
+    scene = SimpleNamespace(target=target, object_id=objects, certified=None)
     return SimpleNamespace(after=SimpleNamespace(**after, reward=reward, scene=scene))
 
 
