@@ -63,6 +63,7 @@ def _decide(options: ActOptions, policy: Any, image: tuple[Any, Any, Any, Any]) 
     mask = None if options.mask is None else image_files.read_mask(options.mask)
     recorder = options.recorder()
     decisions = policy.decide(*image, mask, options.top)
+    options.warn(policy)
     for number, action in enumerate(decisions, 1):
         print(f"{number:2d} {decision_picture.line(action)}")
     if not decisions:

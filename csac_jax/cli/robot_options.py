@@ -29,15 +29,18 @@ class RobotOptions(PolicyOptions):
     """Folder of one robot that stores images, decisions and outcomes, for finetune."""
 
     def load(self) -> Any:
-        """Loads the policy; warns of one that was not trained on images of a camera."""
+        """Loads the policy."""
         from csac_jax.deploy import CameraPolicy, image_files
-        from csac_jax.io import made_for
 
         workspace = None if self.workspace is None else image_files.read_pose(self.workspace)
-        policy = CameraPolicy.load(self.policy, workspace, self.gripper)
+        return CameraPolicy.load(self.policy, workspace, self.gripper)
+
+    def warn(self, policy: Any) -> None:
+        """Warns of a policy that was not trained on images of a camera."""
+        from csac_jax.io import made_for
+
         camera = {"heightmap": {"view": "oblique"}, "sensor": {"kind": "d415"}}
         made_for.warn_if_elsewhere(policy.cfg, policy.cfg.change(**camera))
-        return policy
 
     def recorder(self) -> Any:
         """Opens the record, if there is one."""

@@ -40,6 +40,7 @@ def run(arguments: list[str]) -> int:
 
     with server.claim(options.host, options.port) as listener:
         policy, recorder = options.load(), options.recorder()
+        options.warn(policy)
         policy.warm_up(*options.size, decider.batches())
         app = service.make(policy, options.policy, token, recorder, options.size)
         print(_usage(options, listener.getsockname()[1]), flush=True)

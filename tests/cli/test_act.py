@@ -142,7 +142,7 @@ def test_bad_files_are_one_line(
     assert cli.main(["act", *given]) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert len([line for line in captured.err.splitlines() if ": warning: " not in line]) == 1
+    assert captured.err.count("\n") == 1
     assert message in captured.err
     assert cli.main(["act", "nowhere", *given[1:]]) == 1
     assert "there is no folder nowhere" in capsys.readouterr().err
@@ -198,7 +198,7 @@ def test_bad_options(
     assert cli.main(arguments.format(" ".join(given[1:])).split()) == 2
     captured = capsys.readouterr()
     assert message in captured.err
-    assert len([line for line in captured.err.splitlines() if ": warning: " not in line]) == 1
+    assert captured.err.count("\n") == 1
     assert sorted(tmp_path.iterdir()) == files
 
 
