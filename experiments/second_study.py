@@ -8,10 +8,12 @@ pack DIR           an archive of each part that has begun, into experiments/resu
 report             the tables, from the archives
 
 An arm is a sweep in DIR/PART/ARM. `run` goes on where it stopped; its exit code is 3 if arms are
-left. With --smoke there is one tiny arm.
+left. Each GPU runs arms of its own: `--only control/* replay/*-16`. With --smoke there is one tiny
+arm.
 """
 
 import argparse
+import fnmatch
 import io
 import itertools
 import json
@@ -348,6 +350,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=9.0, help="of this call of run")
     parser.add_argument("--archives", type=Path, default=study.ARCHIVES)
     parser.add_argument("--jobs", type=int, default=max(1, processes.cores() - RESERVED))
+    parser.add_argument("--only", nargs="+", default=["*"], help="patterns of PART/ARM")
     parser.add_argument("--smoke", action="store_true", help="one tiny arm, for a test")
     options = parser.parse_args(arguments)
     try:
@@ -359,10 +362,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def call(options: argparse.Namespace) -> int:
     """Carries out a command; returns the exit code."""
-    chosen = smoke_arms() if options.smoke else arms()
+    planned = smoke_arms() if options.smoke else arms()
+    chosen = [arm for arm in planned if any(fnmatch.fnmatch(arm.place, p) for p in options.only)]
+    require(len(chosen) > 0, f"--only {' '.join(options.only)}: no arm has such a name")
     if options.command == "run":
         own = [sys.executable, "-m", "experiments.second_study", "evaluate", str(options.folder)]
         own += ["--jobs", str(options.jobs), *(["--smoke"] if options.smoke else [])]
+        own += ["--only", *options.only]
         return 0 if run(chosen, options.folder, options.minutes, own) else 3
     if options.command == "evaluate":
         evaluate(chosen, options.folder, options.jobs)

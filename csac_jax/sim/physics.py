@@ -116,12 +116,12 @@ def reachable(cfg: Config, height: jax.Array, action: Action) -> jax.Array:
 
 
 def healthy(scene: SceneState) -> jax.Array:
-    """Returns [] bool, every entry of a scene lies within its bounds, which NaN does not."""
-    reach = jnp.where(scene.in_play[:, None], 1.0, 100.0)  # m from the workspace centre
+    """Returns [] bool, every entry of a scene lies within its bounds, which NaN does not. A block
+    that a grip threw metres away does: it is lost."""
     speed = jnp.array([20.0, 20.0, 20.0, 200.0, 200.0, 200.0])  # m/s and rad/s
     length = jnp.sum(scene.quaternion**2, axis=1)
     bounded = (
-        jnp.all(jnp.abs(scene.position) < reach),
+        jnp.all(jnp.abs(scene.position) < 100.0),  # m from the workspace centre
         jnp.all(jnp.abs(scene.velocity) < speed),
         jnp.all(jnp.abs(length - 1.0) < 0.01),
         jnp.all((scene.half_size > 0.0) & (scene.half_size < 0.5)),  # m

@@ -144,9 +144,13 @@ def test_faults_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert second_study.main(["status", str(tmp_path / "runs"), "--smoke"]) == 1
     (tmp_path / "second-replay.tar.xz").write_text("no archive")
     assert second_study.main(["report", "--archives", str(tmp_path), "--smoke"]) == 1
-    first, second = capsys.readouterr().err.splitlines()
+    assert second_study.main(["plan", "--only", "replay/*-3"]) == 1
+    first, second, third = capsys.readouterr().err.splitlines()
     assert f"{plan} cannot be read" in first
     assert "second-replay.tar.xz is no archive of runs" in second
+    assert "--only replay/*-3: no arm has such a name" in third
+    assert second_study.main(["plan", "--only", "control/*", "replay/*-16"]) == 0
+    assert "28.8 minutes in all" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ CASES: dict[str, tuple[SceneState, Action]] = {
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
     "spinning": (_spinning(), push(-0.1, -0.1)),
     "nan": (_kicked(np.nan), grasp(0.15, -0.15)),
-    "exploded": (_kicked(1e3), grasp(0.15, -0.15)),
+    "kicked": (_kicked(1e3), grasp(0.15, -0.15)),
 }
 
 
