@@ -32,6 +32,7 @@ from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
 PAGES = ROOT / "build" / "pages"
+APP = ROOT / "build" / "browser" / "app.js"  # of the page that `make docs` bundles where node is
 BUILT = {"All results": "all-results.md", "Records": "records.md"}
 LANGUAGES = {".py": "python", ".json": "json", ".toml": "toml"}
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
@@ -77,6 +78,8 @@ def on_files(files: Any, config: Any) -> Any:
     linked = {path for page in pages for _, path in _outside(page.src_uri, page.content_string)}
     for name in filter(lambda name: (PAGES / name).exists(), BUILT.values()):
         files.append(File.generated(config, name, abs_src_path=str(PAGES / name)))
+    if APP.exists():
+        files.append(File.generated(config, "browser.js", abs_src_path=str(APP)))
     for path in sorted(linked):
         if (ROOT / path).is_file() and (text := _as_markdown(ROOT / path)):
             files.append(File.generated(config, _source_page(path), content=text))
@@ -208,6 +211,13 @@ def record_table() -> str:
     return _table(("field", "meaning"), [(f"`{f.name}`", docs.get(f.name, "")) for f in fields])
 
 
+def browser() -> str:
+    """Returns the place of the page's script, or one line where the script was not built."""
+    if not APP.exists():
+        return "This site was built without node. `make docs` adds the page's script where node is."
+    return '<div id="demo"></div>\n<script src="browser.js"></script>'
+
+
 def described(module: Any) -> Callable[[], str]:
     """Makes a table of the names that a module's docstring describes, in columns."""
     found = re.findall(r"(?m)^(`?\w[\w ]*`?)  +(.*(?:\n  +.*)*)", module.__doc__)
@@ -228,6 +238,7 @@ def _text(text: str) -> str:
 INSERTS: dict[str, Callable[[], str]] = {
     "settings": settings_tables,
     "commands": commands,
+    "browser": browser,
     "record": record_table,
     "metrics": described(metrics),
     "suites": described(suites),
