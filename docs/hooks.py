@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the package of this checkout, even where another is installed
 
 from latex2mathml.converter import convert  # noqa: E402
+from mkdocs.plugins import event_priority  # noqa: E402
 from mkdocs.structure.files import File  # noqa: E402
 from tyro import _docstrings  # noqa: E402
 
@@ -117,6 +118,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
     """Turns equations into MathML, which browsers draw without a script."""
     return EQUATION.sub(_mathml, content)
+
+
+@event_priority(-100)  # after the plugin that writes the index
+def on_post_build(config: Any) -> None:
+    """Writes the search index as a script, too: pages of the file system may read no other file."""
+    index = Path(config.site_dir, "search", "search_index.json")
+    index.with_suffix(".js").write_text(f"var __index = {index.read_text()}")
 
 
 def _mathml(found: re.Match) -> str:

@@ -49,7 +49,7 @@ export class Demo {
     Object.assign(this, { engine, session, content, page, speed: 0.5, running: false });
     this.world = new World(engine, content);
     this.hand = [...REST, ...content.robot.positions.map((ends) => ends[1])];
-    this.times = { decision: 0, frames: 0 };
+    this.times = { decisions: [], frames: [] }; // ms of each, frames/s of each animation
   }
 
   /** Starts with a scene of the content. */
@@ -87,7 +87,7 @@ export class Demo {
     this.obs = observe(view, this.world.parts(this.number, this.scene));
     this.maps = await maps(this.session, view, this.obs);
     this.decision = choose(view, this.maps, this.avoided);
-    this.times.decision = performance.now() - begun;
+    this.times.decisions.push(performance.now() - begun);
     this.page.showMaps(this.obs, bestOverYaws(view, this.maps), this.decision);
     return this.decision;
   }
@@ -105,7 +105,9 @@ export class Demo {
         this.page.draw(this.world, this.scene.inPlay);
         frames += 1;
         if (!mover.done) return request();
-        this.times.frames = (1000 * frames) / (performance.now() - begun);
+        const rate = (1000 * frames) / (performance.now() - begun);
+        this.times.frames.push(rate);
+        if (this.speed <= 1) this.page.adapt(rate);
         resolve();
       };
       const request = () =>

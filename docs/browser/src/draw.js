@@ -3,47 +3,59 @@
 import * as three from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
-const { PLANE, BOX, MESH } = { PLANE: 0, BOX: 6, MESH: 7 }; // of mjtGeom
-const THEMES = { light: [0xf4f4f2, 0xdcdad5, 0x8a8782], dark: [0x22252e, 0x363944, 0x8088a0] };
+const [PLANE, BOX, MESH] = [0, 6, 7]; // of mjtGeom
+const SUN = new three.Vector3(0.36, 0.48, 0.8); // the light of the policy's view
+const THEMES = {
+  light: { sky: 0xf4f4f2, ground: 0xdcdad5, border: 0x8a8782, shadow: 0xb4b1ab },
+  dark: { sky: 0x22252e, ground: 0x363944, border: 0x8088a0, shadow: 0x23252d },
+};
+const SLOW = 30; // frames/s, below which the picture gets coarser
+const COARSEST = 0.4; // pixels of the picture for one of the page, along a side
+
+// Moves points along the sun's rays onto the table; a thousandth of a height keeps faces apart.
+const ONTO_TABLE = new three.Matrix4().set(
+  ...[1, 0, -SUN.x / SUN.z, 0],
+  ...[0, 1, -SUN.y / SUN.z, 0],
+  ...[0, 0, 0.001, -0.001],
+  ...[0, 0, 0, 1],
+);
 
 /** A picture of a world. */
 export class Picture {
   constructor(canvas, view) {
     this.renderer = new three.WebGLRenderer({ canvas, antialias: true });
-    this.renderer.shadowMap.enabled = true;
     this.scene = new three.Scene();
     this.camera = new three.PerspectiveCamera(36, 1, 0.05, 10);
     this.camera.up.set(0, 0, 1);
-    this.camera.position.set(0.12, -0.82, 0.66);
+    this.camera.position.set(0.1, -0.72, 0.6);
     this.controls = new OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enablePan: false, minDistance: 0.5, maxDistance: 2, maxPolarAngle: 1.45 });
-    this.controls.target.set(0, 0, 0.05);
+    this.controls.target.set(0, 0, 0.06);
     this.controls.update();
     this.light();
     this.table(view);
     this.geoms = new three.Group();
-    this.scene.add(this.geoms);
+    this.shadows = new three.Group();
+    this.shadow = new three.MeshBasicMaterial();
+    this.scene.add(this.geoms, this.shadows);
+    this.ratio = Math.min(window.devicePixelRatio, 2);
   }
 
   light() {
-    const sun = new three.DirectionalLight(0xffffff, 2.2);
-    sun.position.set(0.36, 0.48, 0.8).multiplyScalar(1.5); // the light of the policy's view
-    sun.castShadow = true;
-    sun.shadow.mapSize.set(1024, 1024);
-    Object.assign(sun.shadow.camera, { left: -0.5, right: 0.5, top: 0.5, bottom: -0.5, far: 3 });
-    sun.shadow.normalBias = 0.002;
-    this.scene.add(sun, new three.HemisphereLight(0xffffff, 0xb0a8a0, 1.3));
+    const sun = new three.DirectionalLight(0xffffff, 1.7);
+    sun.position.copy(SUN);
+    this.scene.add(sun, new three.HemisphereLight(0xffffff, 0xc8c0b8, 2));
   }
 
   table({ extent }) {
     this.ground = new three.Mesh(
       new three.CircleGeometry(0.62, 64),
-      new three.MeshLambertMaterial({ polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 }),
+      new three.MeshBasicMaterial(),
     );
-    this.ground.receiveShadow = true;
+    this.ground.position.z = -0.002;
     const half = 0.5 * extent;
     const corners = [[-half, -half], [half, -half], [half, half], [-half, half]];
-    const points = corners.map(([x, y]) => new three.Vector3(x, y, 0.0005));
+    const points = corners.map(([x, y]) => new three.Vector3(x, y, 0.0002));
     this.border = new three.LineLoop(
       new three.BufferGeometry().setFromPoints(points),
       new three.LineBasicMaterial(),
@@ -53,10 +65,11 @@ export class Picture {
 
   /** Takes the colours of the page's theme, `light` or `dark`. */
   paint(theme) {
-    const [sky, ground, border] = THEMES[theme];
+    const { sky, ...others } = THEMES[theme];
     this.scene.background = new three.Color(sky);
-    this.ground.material.color.set(ground);
-    this.border.material.color.set(border);
+    this.ground.material.color.set(others.ground);
+    this.border.material.color.set(others.border);
+    this.shadow.color.set(others.shadow);
   }
 
   /** Makes the geoms of a world, whose blocks have changed. */
@@ -64,13 +77,16 @@ export class Picture {
     const { model, content } = world;
     this.geoms.children.forEach((mesh) => mesh.geometry.dispose());
     this.geoms.clear();
+    this.shadows.clear();
     for (let geom = 0; geom < model.ngeom; geom++) {
       if (model.geom_type[geom] === PLANE) continue;
       const slot = content.addresses.slotOfGeom[geom] ?? world.blocks;
       const mesh = new three.Mesh(shape(model, geom), material(world, geom, slot));
-      Object.assign(mesh, { castShadow: true, receiveShadow: true, matrixAutoUpdate: false });
-      mesh.userData = { geom, slot };
+      mesh.matrixAutoUpdate = false;
+      mesh.userData = { geom, slot, shadow: new three.Mesh(mesh.geometry, this.shadow) };
+      mesh.userData.shadow.matrixAutoUpdate = false;
       this.geoms.add(mesh);
+      this.shadows.add(mesh.userData.shadow);
     }
   }
 
@@ -78,7 +94,7 @@ export class Picture {
   draw(world, shown) {
     const { geom_xpos: place, geom_xmat: turn } = world.data;
     for (const mesh of this.geoms.children) {
-      const { geom, slot } = mesh.userData;
+      const { geom, slot, shadow } = mesh.userData;
       const [p, m] = [3 * geom, 9 * geom];
       mesh.visible = slot < 0 || shown[slot];
       mesh.matrix.set(
@@ -87,6 +103,8 @@ export class Picture {
         ...[turn[m + 6], turn[m + 7], turn[m + 8], place[p + 2]],
         ...[0, 0, 0, 1],
       );
+      shadow.visible = mesh.visible && place[p + 2] > 0;
+      shadow.matrix.multiplyMatrices(ONTO_TABLE, mesh.matrix);
     }
     this.fit();
     this.renderer.render(this.scene, this.camera);
@@ -96,12 +114,18 @@ export class Picture {
   fit() {
     const { clientWidth: width, clientHeight: height } = this.renderer.domElement;
     const size = this.renderer.getSize(new three.Vector2());
-    if (!width || (size.x === width && size.y === height)) return;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    const isSame = size.x === width && size.y === height;
+    if (!width || (isSame && this.renderer.getPixelRatio() === this.ratio)) return;
+    this.renderer.setPixelRatio(this.ratio);
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / height;
     this.camera.zoom = Math.min(1, this.camera.aspect / 1.25); // narrow pictures show it all
     this.camera.updateProjectionMatrix();
+  }
+
+  /** Draws coarser from now on, where there were fewer frames/s than SLOW. */
+  adapt(frames) {
+    if (frames < SLOW) this.ratio = Math.max(0.7 * this.ratio, COARSEST);
   }
 
   /** Returns the slot of the block under a pointer, or -1, and the pointer's ray. */
@@ -151,5 +175,5 @@ function material(world, geom, slot) {
   const own = slot === world.blocks ? world.own?.colour : view.colours[world.colours[slot]];
   const [r, g, b] = slot < 0 ? rgba : own;
   const colour = new three.Color().setRGB(r, g, b, three.SRGBColorSpace);
-  return new three.MeshStandardMaterial({ color: colour, roughness: 0.75, metalness: slot < 0 ? 0.2 : 0 });
+  return new three.MeshLambertMaterial({ color: colour });
 }

@@ -13,18 +13,18 @@ import { GRASP, PUSH } from "./primitives.js";
 
 const HELD = 0.16; // m, height of a block that is dragged
 const ELEMENTS = `
-  <div class="demo-scene"><canvas data-is="scene" aria-label="The scene"></canvas></div>
-  <div class="demo-maps">
-    <figure><canvas data-is="view"></canvas><figcaption>Seen from above</figcaption></figure>
-    <figure><canvas data-is="push"></canvas><figcaption data-is="pushed">Push value</figcaption></figure>
-    <figure><canvas data-is="grasp"></canvas><figcaption data-is="grasped">Grasp value</figcaption></figure>
-  </div>
   <div class="demo-controls">
     <button class="md-button md-button--primary" data-is="clear">Clear the table</button>
     <button class="md-button" data-is="act">One action</button>
     <button class="md-button" data-is="drop">Drop anew</button>
     <label class="md-button">Add a mesh<input type="file" accept=".obj" data-is="mesh"></label>
     <label>Scene <select data-is="scenes"></select></label>
+  </div>
+  <div class="demo-scene"><canvas data-is="scene" aria-label="The scene"></canvas></div>
+  <div class="demo-maps">
+    <figure><canvas data-is="view"></canvas><figcaption>Seen from above</figcaption></figure>
+    <figure><canvas data-is="push"></canvas><figcaption data-is="pushed">Push value</figcaption></figure>
+    <figure><canvas data-is="grasp"></canvas><figcaption data-is="grasped">Grasp value</figcaption></figure>
   </div>
   <p class="demo-status" role="status" data-is="status"></p>
   <p class="demo-numbers" data-is="numbers"></p>`;
@@ -65,6 +65,10 @@ class Page {
     this.picture.draw(world, shown);
   }
 
+  adapt(frames) {
+    this.picture.adapt(frames);
+  }
+
   redraw() {
     if (this.drawn && this.drawn[0].data) this.picture.draw(...this.drawn);
   }
@@ -89,8 +93,9 @@ class Page {
   report({ scene, times, actions }, text) {
     const left = scene.inPlay.filter(Boolean).length;
     this.parts.status.textContent = text;
-    const speed = `decision ${Math.round(times.decision)} ms, ${Math.round(times.frames)} frames/s`;
-    this.parts.numbers.textContent = `${left} left after ${actions} actions; ${speed}`;
+    const [decision, frames] = [times.decisions, times.frames].map((all) => Math.round(all.at(-1)));
+    const speed = frames ? `, ${frames} frames/s` : "";
+    this.parts.numbers.textContent = `${left} left after ${actions} actions; decision ${decision} ms${speed}`;
   }
 
   say(text) {
