@@ -78,7 +78,7 @@ browser: $(STAMP)  ## bundle the script of the page "In the browser" into build/
 	mkdir -p build/browser
 	cp docs/browser/package.json docs/browser/package-lock.json build/browser
 	npm ci --prefix build/browser --silent
-	$(BIN)/python docs/browser/export.py build/browser
+	$(BIN)/python -m docs.browser.export build/browser
 	node docs/browser/build.mjs build/browser
 
 dist: $(STAMP)  ## build wheel and sdist into dist/, and check them

@@ -1,6 +1,6 @@
 """Writes the world, the scenes and the policy of the page "In the browser".
 
-    python docs/browser/export.py build/browser
+    python -m docs.browser.export build/browser
 """
 
 import dataclasses
