@@ -67,10 +67,12 @@ figures: $(STAMP)  ## the tables and figures of docs/ that are made from the rec
 	$(BIN)/python -m experiments.study
 	$(BIN)/python -m experiments.figures
 
-docs: $(STAMP)  ## build the site of docs/ into build/docs; no network is needed
+docs: $(STAMP)  ## build the site of docs/ into build/docs; only the page "In the browser" needs a network
 	$(BIN)/csac-jax report experiments/results --markdown build/pages/all-results.md > /dev/null
 	$(BIN)/python -m experiments.index
-	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory browser; else rm -f build/browser/app.js; echo "docs: no node here; the page 'In the browser' is left out"; fi
+	@rm -f build/browser/app.js
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory browser; fi || true
+	@test -f build/browser/app.js || echo "docs: the page 'In the browser' is left out; it needs node and npm's registry"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "read it: $(BIN)/python -m http.server --directory build/docs"
 

@@ -96,7 +96,7 @@ async function addMesh(page) {
   await page.evaluate(() => csac.load(0));
   await page.setInputFiles("[data-is=mesh]", job.mesh);
   await page.waitForFunction(
-    () => csac.world.own && document.querySelector("[data-is=status]").textContent.startsWith("At rest"),
+    () => csac.world.own && /^At rest/.test(document.querySelector("[data-is=status]").textContent),
     null,
     { timeout: MINUTE },
   );

@@ -153,7 +153,7 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
 
 
 def to_mjcf(scene: SceneConfig, sim: SimConfig) -> str:
-    """Returns the world that `build` compiles as MJCF text, blocks parked, at their largest size."""
+    """Returns the world that `build` compiles as MJCF text, blocks at their largest size."""
     spec = _spec(scene, sim, grippers.load(sim.gripper))
     spec.compile()
     text: str = spec.to_xml()

@@ -1,6 +1,6 @@
 """Writes the world, the scenes and the policy of the page "In the browser".
 
-    python -m docs.browser.export build/browser
+`python -m docs.browser.export build/browser` writes them into that folder.
 """
 
 import dataclasses

@@ -7,7 +7,7 @@ import { bestOverYaws, choose, maps } from "./policy.js";
 import { GRASP, PUSH, plan } from "./primitives.js";
 import { Fall, Motion, World } from "./world.js";
 
-const REST = [0.3, 0.08, 0.24, 0]; // m, rad: where the hand waits and puts down what it took
+const REST = [0.25, 0.3, 0.1, 0]; // m, rad: where the hand waits and puts down what it took
 const TRAVEL = 0.35; // s, of the hand between two places
 const SETTLE = 2.5; // s, in which dropped blocks come to rest
 const DROP = { side: 0.2, height: 0.12, spacing: 0.1 }; // m
@@ -86,7 +86,7 @@ export class Demo {
     const { view } = this.content;
     this.obs = observe(view, this.world.parts(this.number, this.scene));
     this.maps = await maps(this.session, view, this.obs);
-    this.decision = choose(view, this.maps, this.avoided);
+    this.decision = choose(view, this.maps, this.avoided) ?? choose(view, this.maps);
     this.times.decisions.push(performance.now() - begun);
     this.page.showMaps(this.obs, bestOverYaws(view, this.maps), this.decision);
     return this.decision;
@@ -146,7 +146,7 @@ export class Demo {
   /** Acts until the table is clear, nothing can be done, or `running` is false. */
   async clear() {
     this.running = true;
-    while (this.running && this.decision && this.actions < MOST_ACTIONS) await this.act();
+    for (let i = 0; i < MOST_ACTIONS && this.running && this.decision; i++) await this.act();
     this.running = false;
   }
 
@@ -170,6 +170,7 @@ export class Demo {
 
   /** Lets a scene fall, and decides about it. */
   async fall(scene) {
+    await this.deciding;
     this.scene = scene;
     const fall = new Fall(this.world, scene, SETTLE);
     const { speed } = this;
@@ -178,10 +179,11 @@ export class Demo {
     await this.restart(fall.result().scene);
   }
 
-  /** Holds a block at (x, y) m in the air, by a pointer. */
-  drag(slot, [x, y], z) {
-    this.scene.pose.set([x, y, z], 7 * slot);
+  /** Holds a block at [x, y, z] m; its maps follow as soon as the last ones are there. */
+  drag(slot, place) {
+    this.scene.pose.set(place, 7 * slot);
     this.place(this.scene);
+    this.deciding ??= this.decide().finally(() => (this.deciding = null));
   }
 
   /** Drops a mesh, the text of an OBJ file, onto the scene as a convex body. */
@@ -216,7 +218,8 @@ function describe({ primitive, pose: [x, y, yaw], score }, { outcome, lifted, lo
   const turn = `${Math.round((180 * yaw) / Math.PI)}°`;
   const name = primitive === PUSH ? "Push" : "Grasp";
   const value = score === undefined ? "" : `, Q ${score.toFixed(2)}`;
-  const effect = primitive === GRASP ? NAMES[outcome] : "done";
-  const number = lifted.length > 1 ? ` ${lifted.length}` : "";
-  return `${name} at ${place}, ${turn}${value}: ${effect}${number}${lost.length ? ", a block lost" : ""}`;
+  const effects = [primitive === GRASP ? NAMES[outcome] : "done"];
+  if (lifted.length > 1) effects.push(`${lifted.length} blocks`);
+  if (lost.length) effects.push("a block lost");
+  return `${name} at ${place}, ${turn}${value}: ${effects.join(", ")}`;
 }

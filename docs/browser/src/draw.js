@@ -29,7 +29,8 @@ export class Picture {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(0.1, -0.72, 0.6);
     this.controls = new OrbitControls(this.camera, canvas);
-    Object.assign(this.controls, { enablePan: false, minDistance: 0.5, maxDistance: 2, maxPolarAngle: 1.45 });
+    const limits = { enablePan: false, minDistance: 0.5, maxDistance: 2, maxPolarAngle: 1.45 };
+    Object.assign(this.controls, limits);
     this.controls.target.set(0, 0, 0.06);
     this.controls.update();
     this.light();

@@ -23,8 +23,8 @@ const ELEMENTS = `
   <div class="demo-scene"><canvas data-is="scene" aria-label="The scene"></canvas></div>
   <div class="demo-maps">
     <figure><canvas data-is="view"></canvas><figcaption>Seen from above</figcaption></figure>
-    <figure><canvas data-is="push"></canvas><figcaption data-is="pushed">Push value</figcaption></figure>
-    <figure><canvas data-is="grasp"></canvas><figcaption data-is="grasped">Grasp value</figcaption></figure>
+    <figure><canvas data-is="push"></canvas><figcaption data-is="pushed"></figcaption></figure>
+    <figure><canvas data-is="grasp"></canvas><figcaption data-is="grasped"></figcaption></figure>
   </div>
   <p class="demo-status" role="status" data-is="status"></p>
   <p class="demo-numbers" data-is="numbers"></p>`;
@@ -76,7 +76,7 @@ class Page {
   showMaps(obs, q, decision) {
     const { view, robot } = content;
     const valid = q.flatMap((values) => Array.from(values.filter(Number.isFinite)));
-    const range = [valid.reduce((a, b) => Math.min(a, b), 0), valid.reduce((a, b) => Math.max(a, b), 0)];
+    const range = [Math.min, Math.max].map((end) => valid.reduce((a, b) => end(a, b), 0));
     drawView(this.parts.view, view, obs);
     for (const [primitive, name] of [[PUSH, "push"], [GRASP, "grasp"]]) {
       drawQ(this.parts[name], view, q[primitive], range);
@@ -93,9 +93,10 @@ class Page {
   report({ scene, times, actions }, text) {
     const left = scene.inPlay.filter(Boolean).length;
     this.parts.status.textContent = text;
-    const [decision, frames] = [times.decisions, times.frames].map((all) => Math.round(all.at(-1)));
-    const speed = frames ? `, ${frames} frames/s` : "";
-    this.parts.numbers.textContent = `${left} left after ${actions} actions; decision ${decision} ms${speed}`;
+    const numbers = [`${left} left after ${actions} actions`];
+    numbers.push(`decision ${Math.round(times.decisions.at(-1))} ms`);
+    if (times.frames.length) numbers.push(`${Math.round(times.frames.at(-1))} frames/s`);
+    this.parts.numbers.textContent = numbers.join(", ");
   }
 
   say(text) {
@@ -140,8 +141,7 @@ function connect(demo, page) {
   parts.drop.onclick = () => alone(() => fallen(() => demo.drop()));
   parts.scenes.onchange = () => alone(() => start(demo, page, Number(parts.scenes.value)));
 
-  const add = (file) =>
-    alone(() => fallen(async () => demo.addMesh(await file.text())));
+  const add = (file) => alone(() => fallen(async () => demo.addMesh(await file.text())));
   parts.mesh.onchange = () => {
     if (parts.mesh.files.length) add(parts.mesh.files[0]);
     parts.mesh.value = "";
@@ -163,7 +163,7 @@ function connect(demo, page) {
     const { slot, ray } = picture.pick(event);
     if (held < 0) return (parts.scene.style.cursor = slot >= 0 && !isBusy ? "grab" : "");
     const place = onLevel(ray, HELD);
-    if (place && place.every((value) => Math.abs(value) < 0.2)) demo.drag(held, place, HELD);
+    if (place && place.every((value) => Math.abs(value) < 0.2)) demo.drag(held, [...place, HELD]);
   });
   for (const name of ["pointerup", "pointercancel"]) {
     parts.scene.addEventListener(name, () => {
@@ -192,7 +192,8 @@ function listScenes(select) {
 async function main(root) {
   root.textContent = "Unpacking MuJoCo, onnxruntime and the policy";
   try {
-    const [mujoco, runtime, policy] = await Promise.all([mujocoFile, runtimeFile, policyFile].map(unpack));
+    const files = [mujocoFile, runtimeFile, policyFile];
+    const [mujoco, runtime, policy] = await Promise.all(files.map(unpack));
     const engine = await loadMujoco({ wasmBinary: mujoco });
     const session = await load(runtime, policy);
     const page = new Page(root);

@@ -2,7 +2,7 @@
 
 import { PUSH } from "./primitives.js";
 
-const VIRIDIS = ["440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725"];
+const VIRIDIS = "440154 472d7b 3b528b 2c728e 21918c 28ae80 5ec962 addc30 fde725".split(" ");
 const STOPS = VIRIDIS.map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16)));
 const TALLEST = 0.12; // m, the end of the height map's scale
 const CHOSEN = "#d55e00"; // palette of Okabe and Ito
@@ -16,12 +16,12 @@ export function drawQ(canvas, view, q, [low, high]) {
   });
 }
 
-/** Draws the colours and heights [H * W] m of a view: higher is lighter. */
+/** Draws the colours [H * W * 3] of a view; what has a height [H * W] m is lighter. */
 export function drawView(canvas, view, { height, colour }) {
   drawCells(canvas, view, height, (value, cell) => {
-    const share = 0.55 + 0.45 * Math.min(value / TALLEST, 1);
-    const rgb = colour.subarray(3 * cell, 3 * cell + 3);
-    return [...Array.from(rgb, (level) => 255 * Math.min(level * (value > 0 ? share + 0.45 : 1), 1)), 255];
+    const gain = value > 0 ? 1 + 0.45 * Math.min(value / TALLEST, 1) : 1;
+    const levels = colour.subarray(3 * cell, 3 * cell + 3).map((level) => 255 * level * gain);
+    return [...levels, 255];
   });
 }
 

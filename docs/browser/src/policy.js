@@ -8,7 +8,7 @@ const PRIMITIVES = 2;
 export async function load(wasm, model) {
   ort.env.wasm.numThreads = 1; // more need a server's headers
   ort.env.wasm.wasmBinary = wasm;
-  return ort.InferenceSession.create(model, { logSeverityLevel: 3 }); // errors; it warns of folding
+  return ort.InferenceSession.create(model, { logSeverityLevel: 3 }); // errors alone
 }
 
 /** Computes the dense maps of a view, {q, cells, choice}, maps flat [P * K * h * w]. */
@@ -54,7 +54,8 @@ function cellPose({ yaws, side, cell }, index) {
 /** Returns the largest Q over yaws at the cells of the view, [P][H * W]; -Infinity where none. */
 export function bestOverYaws(view, { q, cells }) {
   const { size, extent, yaws } = view;
-  const best = Array.from({ length: PRIMITIVES }, () => new Float32Array(size ** 2).fill(-Infinity));
+  const nowhere = new Float32Array(size ** 2).fill(-Infinity);
+  const best = Array.from({ length: PRIMITIVES }, () => nowhere.slice());
   for (let k = 0; k < yaws; k++) {
     const yaw = (2 * Math.PI * k) / yaws;
     const [cos, sin] = [Math.cos(yaw), Math.sin(yaw)];

@@ -151,7 +151,8 @@ function putRows(array, rows, values) {
 /** Adds an object of one mesh as the last body, with its touch sensors. */
 function withOwn(mjcf, own, slot) {
   const name = `block${slot}`;
-  const mesh = `<mesh name="own" inertia="convex" maxhullvert="64" vertex="${own.vertices.join(" ")}"/>`;
+  const vertices = own.vertices.join(" ");
+  const mesh = `<mesh name="own" inertia="convex" maxhullvert="64" vertex="${vertices}"/>`;
   const body = `<body name="${name}" pos="${3 + 0.3 * slot} 0 1"><joint name="${name}" type="free"/>
     <geom class="blocks/block" type="mesh" mesh="own"/></body>`;
   const sensors = ["palm", "pad_low", "pad_high"].map(
