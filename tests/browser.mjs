@@ -91,9 +91,13 @@ async function dropAndClear(speed) {
   return { before, after: csac.scene.inPlay.filter(Boolean).length };
 }
 
-/** Adds a mesh by the file button: its height in the view, m, and what is in play. */
+/** Adds a mesh by the file button, far from the blocks: where it is at rest, in the view, too. */
 async function addMesh(page) {
-  await page.evaluate(() => csac.load(0));
+  await page.evaluate(async () => {
+    await csac.load(0);
+    csac.scene.inPlay.fill(false);
+    await csac.show(csac.world.park(csac.scene));
+  });
   await page.setInputFiles("[data-is=mesh]", job.mesh);
   await page.waitForFunction(
     () => csac.world.own && /^At rest/.test(document.querySelector("[data-is=status]").textContent),

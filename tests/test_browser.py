@@ -26,7 +26,7 @@ CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 PROGRAMS = {"node": shutil.which("node"), "npm": shutil.which("npm"), "chromium": CHROMIUM}
 MISSING = [name for name, path in PROGRAMS.items() if path is None]
 GRASPS = 20
-CUBE = "".join(f"v {x} {y} {z}\n" for x in (-20, 20) for y in (-20, 20) for z in (-20, 20))
+BRICK = "".join(f"v {x} {y} {z}\n" for x in (90, 130) for y in (0, 50) for z in (-20, 10))
 
 pytestmark = [
     pytest.mark.slow,
@@ -85,8 +85,8 @@ def wanted() -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def measured(page: Path, wanted: list[dict[str, Any]]) -> dict[str, Any]:
     """Drives the page; returns what the driver measured."""
-    mesh, results, job = (page.parent / name for name in ("cube.obj", "results.json", "job.json"))
-    mesh.write_text(CUBE)
+    mesh, results, job = (page.parent / name for name in ("brick.obj", "results.json", "job.json"))
+    mesh.write_text(BRICK)
     paths = {"modules": BUILT, "chromium": CHROMIUM, "page": page, "mesh": mesh, "results": results}
     poses = {"grasps": [scene["pose"] for scene in wanted]}
     job.write_text(json.dumps({name: str(path) for name, path in paths.items()} | poses))
@@ -131,11 +131,12 @@ def test_clears(measured: dict[str, Any]):
 
 
 def test_mesh(measured: dict[str, Any]):
-    """Claim: a mesh of 40 mm cubes falls on the table as a convex body, which the view shows."""
+    """Claim: a brick of an OBJ file, 30 x 40 x 50 mm, away from its origin, comes to rest on the
+    table, and the view shows its upper face."""
     mesh = measured["mesh"]
     assert mesh["inPlay"]
-    assert mesh["height"] >= 0.019
-    assert mesh["centre"] >= 0.019
+    np.testing.assert_allclose(mesh["height"], 2.0 * mesh["centre"], atol=1e-3)
+    assert np.min(np.abs(mesh["centre"] - np.array([0.015, 0.02, 0.025]))) < 1e-3
 
 
 def test_works_offline(measured: dict[str, Any]):
