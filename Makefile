@@ -14,7 +14,7 @@ STAMP := $(VENV)/.installed
 # Options of the pinned XLA.
 COMPILE_LITTLE := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true --xla_disable_hlo_passes=while-loop-invariant-code-motion
 
-.PHONY: help setup train eval test test-slow test-faults lives lint format bench pictures figures docs dist doctor clean
+.PHONY: help setup train eval test test-slow test-faults lives lint format bench pictures figures docs browser dist doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -67,11 +67,21 @@ figures: $(STAMP)  ## the tables and figures of docs/ that are made from the rec
 	$(BIN)/python -m experiments.study
 	$(BIN)/python -m experiments.figures
 
-docs: $(STAMP)  ## build the site of docs/ into build/docs; no network is needed
+docs: $(STAMP)  ## build the site of docs/ into build/docs; only the page "In the browser" needs a network
 	$(BIN)/csac-jax report experiments/results --markdown build/pages/all-results.md > /dev/null
 	$(BIN)/python -m experiments.index
+	@rm -f build/browser/app.js
+	@if command -v npm > /dev/null; then $(MAKE) --no-print-directory browser; fi || true
+	@test -f build/browser/app.js || echo "docs: the page 'In the browser' is left out; it needs node and npm's registry"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "read it: $(BIN)/python -m http.server --directory build/docs"
+
+browser: $(STAMP)  ## bundle the script of the page "In the browser" into build/browser; needs node
+	mkdir -p build/browser
+	cp docs/browser/package.json docs/browser/package-lock.json build/browser
+	npm ci --prefix build/browser --silent
+	$(BIN)/python -m docs.browser.export build/browser
+	node docs/browser/build.mjs build/browser
 
 dist: $(STAMP)  ## build wheel and sdist into dist/, and check them
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dist]'

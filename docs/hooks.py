@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # the package of this checkout, even where another is installed
 
 from latex2mathml.converter import convert  # noqa: E402
+from mkdocs.plugins import event_priority  # noqa: E402
 from mkdocs.structure.files import File  # noqa: E402
 from tyro import _docstrings  # noqa: E402
 
@@ -32,6 +33,7 @@ from csac_jax.training import loop  # noqa: E402
 
 SOURCES = ROOT / "build" / "sources"  # mkdocs.yml names it, too
 PAGES = ROOT / "build" / "pages"
+APP = ROOT / "build" / "browser" / "app.js"  # of the page that `make docs` bundles where node is
 BUILT = {"All results": "all-results.md", "Records": "records.md"}
 LANGUAGES = {".py": "python", ".json": "json", ".toml": "toml"}
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]*)\]\((\.\./[^)#\s]+)(#[^)\s]*)?\)")
@@ -77,6 +79,8 @@ def on_files(files: Any, config: Any) -> Any:
     linked = {path for page in pages for _, path in _outside(page.src_uri, page.content_string)}
     for name in filter(lambda name: (PAGES / name).exists(), BUILT.values()):
         files.append(File.generated(config, name, abs_src_path=str(PAGES / name)))
+    if APP.exists():
+        files.append(File.generated(config, "browser.js", abs_src_path=str(APP)))
     for path in sorted(linked):
         if (ROOT / path).is_file() and (text := _as_markdown(ROOT / path)):
             files.append(File.generated(config, _source_page(path), content=text))
@@ -114,6 +118,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
 def on_page_content(content: str, page: Any, config: Any, files: Any) -> str:
     """Turns equations into MathML, which browsers draw without a script."""
     return EQUATION.sub(_mathml, content)
+
+
+@event_priority(-100)  # after the plugin that writes the index
+def on_post_build(config: Any) -> None:
+    """Writes the search index as a script, too: pages of the file system may read no other file."""
+    index = Path(config.site_dir, "search", "search_index.json")
+    index.with_suffix(".js").write_text(f"var __index = {index.read_text()}")
 
 
 def _mathml(found: re.Match) -> str:
@@ -208,6 +219,13 @@ def record_table() -> str:
     return _table(("field", "meaning"), [(f"`{f.name}`", docs.get(f.name, "")) for f in fields])
 
 
+def browser() -> str:
+    """Returns the place of the page's script, or one line where the script was not built."""
+    if not APP.exists():
+        return "This site was built without node. `make docs` adds the page's script where node is."
+    return '<div id="demo"></div>\n<script src="browser.js"></script>'
+
+
 def described(module: Any) -> Callable[[], str]:
     """Makes a table of the names that a module's docstring describes, in columns."""
     found = re.findall(r"(?m)^(`?\w[\w ]*`?)  +(.*(?:\n  +.*)*)", module.__doc__)
@@ -228,6 +246,7 @@ def _text(text: str) -> str:
 INSERTS: dict[str, Callable[[], str]] = {
     "settings": settings_tables,
     "commands": commands,
+    "browser": browser,
     "record": record_table,
     "metrics": described(metrics),
     "suites": described(suites),

@@ -43,7 +43,9 @@ def serialize(cfg: Config, params: Params) -> bytes:
     program = _decide(cfg, params)
     model = jax2onnx.to_onnx(program, shapes, opset=OPSET, return_mode="ir", **names)
     common.RemoveUnusedNodesPass()(model)
-    content: bytes = serde.serialize_model(model).SerializeToString()
+    proto = serde.serialize_model(model)
+    del proto.graph.value_info[:]  # onnxruntime-web folds constants to other shapes, and refuses
+    content: bytes = proto.SerializeToString()
     return content
 
 

@@ -152,6 +152,14 @@ def _add_parts(spec: mujoco.MjSpec, body: mujoco.MjsBody, kind: SlotKind) -> Non
             geom.size, geom.pos = half * largest, centre * largest
 
 
+def to_mjcf(scene: SceneConfig, sim: SimConfig) -> str:
+    """Returns the world that `build` compiles as MJCF text, blocks at their largest size."""
+    spec = _spec(scene, sim, grippers.load(sim.gripper))
+    spec.compile()
+    text: str = spec.to_xml()
+    return text
+
+
 def build(scene: SceneConfig, sim: SimConfig) -> World:
     """Builds the world of table, robot and block slots; blocks parked, at their largest size.
 

@@ -1,5 +1,6 @@
 """The model against MuJoCo's own compiler."""
 
+import operator
 import re
 import shutil
 from pathlib import Path
@@ -55,6 +56,15 @@ def _compiled(monkeypatch: pytest.MonkeyPatch, scene: SceneState, scale: float) 
 
 def _fields(world: model.World, scene: SceneState) -> model.BlockFields:
     return jax.device_get(model.scene_fields(world, scene))
+
+
+def test_mjcf_text_is_the_world(world: model.World):
+    """Claim: `to_mjcf` writes the world that `build` compiles; another process can compile it."""
+    theirs = mujoco.MjModel.from_xml_string(model.to_mjcf(CONFIG, SimConfig()))
+    assert theirs.names == world.model.names
+    for field in ("geom_size", "geom_solimp", "mesh_vert", "actuator_gainprm", "opt.timestep"):
+        value = operator.attrgetter(field)
+        np.testing.assert_allclose(value(theirs), value(world.model), rtol=1e-5, err_msg=field)
 
 
 @pytest.mark.parametrize("box", BOXES)
