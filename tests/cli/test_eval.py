@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from csac_jax import cli
-from csac_jax.cli import evaluate
+from csac_jax.cli import evaluate, settings
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.report import suite_table
@@ -40,7 +40,7 @@ def test_suites_are_measured_once(
     tmp_path: Path, measured: list[tuple[str, int]], capsys: pytest.CaptureFixture
 ):
     """Claim: an evaluation that was stopped goes on where it was; another share, other settings and
-    a damaged result are measured again; the table has all suites."""
+    a damaged or changed result are measured again; the table has all suites."""
     out = tmp_path / "out"
     command = ["eval", "shipped", "--policy", "random", "--out", str(out), "--jobs", "1"]
     both = [*command, "--suites", "cases", "random10", "--share", "0.01"]
@@ -58,6 +58,25 @@ def test_suites_are_measured_once(
     (out / "cases.json").write_text('{"suite": "ca')
     assert cli.main([*both, *change]) == 0
     assert [suite for suite, _ in measured[before:]] == ["cases"]
+    changed = (out / "cases.json").read_text().replace('"seconds": 0.1', '"seconds": 0.2')
+    (out / "cases.json").write_text(changed)
+    assert cli.main([*both, *change]) == 0
+    assert [suite for suite, _ in measured[before + 1 :]] == ["cases"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        ("shipped_clutter", "shipped_clutter"),
+        ("runs/my.safetensors --policy learned+planner", "my + planner"),
+        ("shipped --policy random", "random"),
+        ("runs/first --name mine", "mine"),
+    ],
+)
+def test_a_result_names_its_policy(flags: str, name: str):
+    """Claim: in tables a policy has the name of its source, of what acts without one, or --name."""
+    options, _ = settings.parse_view(evaluate.EvalOptions, "eval", flags.split())
+    assert evaluate._name(options) == name
 
 
 def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
