@@ -72,7 +72,7 @@ def _opengl_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
     eye.azimuth = np.degrees(np.arctan2(offset[1], offset[0]))
     eye.elevation = np.degrees(np.arcsin(offset[2] / eye.distance))
     options, sphere = mujoco.MjvOption(), mujoco.mjtGeom.mjGEOM_SPHERE
-    options.geomgroup[:] = 1
+    options.geomgroup[:], options.sitegroup[:] = 1, 0
 
     def draw(data: mujoco.MjData) -> np.ndarray:
         opengl.update_scene(data, eye, options)
