@@ -72,7 +72,7 @@ ONLY_IN = {
     "tensorboardX": ("training/trackers.py",),
     "wandb": ("training/trackers.py",),
     "mlflow": ("training/trackers.py",),
-    "yaml": ("io/configs.py",),
+    "yaml": ("io/configs.py", "report/model_card.py"),
     "trimesh": ("objects", "render/viewer.py"),
     "coacd": ("objects/conversion.py",),
 }

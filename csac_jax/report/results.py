@@ -212,7 +212,7 @@ def _add_run(file: Path, path: Path, results: Results) -> None:
         return
     names = ("actions", "grasp_success", "grasps_counted", "seconds")
     columns = [np.array([line[name] for line in grasped], float) for name in names]
-    record = {"wall_seconds": float(columns[-1][-1]), **_record(file.parent, config)}
+    record = {"wall_seconds": float(columns[-1][-1]), **training_record(file.parent, config)}
     fields = (path, config, _variant(file, path, config), *columns, record, _totals(lines))
     results.runs.append(RecordedRun._make(fields))
 
@@ -224,8 +224,9 @@ def _totals(lines: Sequence[Json]) -> dict[str, int]:
     return {name: sum(row[name] for row in rows) for name in names}
 
 
-def _record(folder: Path, config: Json) -> Json:
-    """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
+def training_record(folder: Path, config: Json) -> Json:
+    """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it or for
+    another config."""
     above = Path(os.path.realpath(folder)).parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
         record = _read_json(place / files.RECORD)

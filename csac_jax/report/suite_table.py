@@ -23,14 +23,14 @@ Json = dict[str, Any]
 def rows(results: Iterable[Json]) -> list[Row]:
     """Builds a row for each part of each result of `csac-jax eval`: suite, policy, episodes and
     METRICS."""
-    return [_row(result, *part) for result in results for part in _parts(result)]
+    return [_row(result, *part) for result in results for part in parts(result)]
 
 
 def merged(results: Iterable[Json]) -> ResultTable:
     """Merges results of several policies suite by suite, what completes most first. A result that
     is given twice counts once."""
     each = {one.get(seal.SHA256, id(one)): one for one in results}.values()
-    entries = [(result, *part) for result in each for part in _parts(result)]
+    entries = [(result, *part) for result in each for part in parts(result)]
     entries.sort(key=lambda entry: (entry[1], -_completion(entry[2])))
     return [
         dict(zip(HEAD, _row(*entry), strict=True))
@@ -39,7 +39,7 @@ def merged(results: Iterable[Json]) -> ResultTable:
     ]
 
 
-def _parts(result: Json) -> Iterator[tuple[str, Json]]:
+def parts(result: Json) -> Iterator[tuple[str, Json]]:
     """Yields the name of each part, with that of its suite, and its metrics."""
     suite = Path(str(result["suite"])).stem
     for part, summary in result.get("parts", {suite: result}).items():

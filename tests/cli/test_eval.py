@@ -1,6 +1,7 @@
 """`csac-jax eval` over several suites."""
 
 import json
+import pickle
 import re
 import sys
 from pathlib import Path
@@ -128,7 +129,8 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
 
 
 def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: each suite is measured with the modules of --import, in a process of its own too."""
+    """Claim: each suite is measured with the modules of --import, in a process of its own too, to
+    which its options can be sent."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     Path("my_empty.py").write_text("")
@@ -143,6 +145,7 @@ def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 130
     assert all("my_empty" in task[-1] for task in tasks)
     assert len(tasks) == 2
+    assert pickle.loads(pickle.dumps(tasks)) == tasks
     options, changes, suite, episodes, _ = tasks[0]
     with pytest.raises(SettingsError, match="'no_module' cannot be imported"):
         evaluate._measure(lambda *_: None, options, changes, suite, episodes, ("no_module",))
