@@ -49,8 +49,8 @@ class EpisodeRenderer:
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = picture.coloured(self._world, self._fields, first.scene)
         self._data = mujoco.MjData(self._model)
-        viewpoint = (viewpoint or VIEWS[cfg.sim.robot])._replace(size=size)
-        self._draw = picture.renderer(self._model, viewpoint, opengl)
+        self._viewpoint = (viewpoint or VIEWS[cfg.sim.robot])._replace(size=size)
+        self._draw = picture.renderer(self._model, self._viewpoint, opengl)
 
     def still(self, step: StepRecord, text: str) -> np.ndarray:
         """Draws the scene before an action, the robot at its start: [H, W, 3] uint8."""
@@ -74,7 +74,7 @@ class EpisodeRenderer:
     def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
         """Shows the steps in a viewer, see `viewer.play`."""
         actions = [(line(number, step), self.poses(step)) for number, step in enumerate(steps, 1)]
-        viewer.play(self._model, actions, log, again)
+        viewer.play(self._model, actions, log, again, self._viewpoint)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()
