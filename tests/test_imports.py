@@ -63,6 +63,7 @@ ONLY_IN = {
     "cv2": ("deploy/board.py",),
     "fastapi": ("deploy/service.py",),
     "uvicorn": ("deploy/server.py",),
+    "mcp": ("cli/mcp_tools.py",),
     "safetensors": ("io",),
     "matplotlib": ("render", "report"),
     "gymnasium": ("gym.py",),
