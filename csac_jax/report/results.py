@@ -231,7 +231,8 @@ def training_record(folder: Path, config: Json) -> Json:
     for place in (folder, *above):
         record = _read_json(place / files.RECORD)
         _check(record, _RECORD, files.RECORD)
-        if record and renames.current(record.get("config", config)) == config:
+        stored = record.get("config", config)
+        if record and isinstance(stored, dict) and renames.current(stored) == config:
             return record
     return {}
 
