@@ -10,9 +10,11 @@ import matplotlib
 
 matplotlib.use("Agg")  # no display
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib import cycler, ticker
 from matplotlib.figure import Figure
 
+from csac_jax.evaluation import metrics
 from csac_jax.report import comparison, figures, results
 from csac_jax.report.comparison import ResultReport
 from csac_jax.report.figures import Chart
@@ -35,6 +37,23 @@ SAMPLERS = {
     "beta": "beta",
     "flashbax": "prioritised, flashbax",
 }
+OURS = {
+    "blocked": "pushes",
+    "enclosed": "pushes",
+    "tray": "shipped_clutter",
+    "hidden": "shipped_target",
+    "target": "shipped_target",
+    "cases": "shipped_clutter",
+    "packed": "shipped_clutter",
+    "random10": "shipped",
+    "random30": "shipped_clutter",
+    "pile": "shipped_objects",
+    "objects_packed": "shipped_objects",
+    "objects10": "shipped_objects",
+    "target_objects": "shipped_target",
+}
+"""Suite -> the policy of ours that is for it; those that need pushes first."""
+BOUNDS = {suite: ("random", "planner" if i < 4 else "oracle") for i, suite in enumerate(OURS)}
 CURVES = {
     "scenes": "scenes side by side",
     "blocks": "blocks on the table",
@@ -52,6 +71,7 @@ def linked() -> set[str]:
 
 def draw() -> Iterator[tuple[str, Figure]]:
     """Draws all figures and yields them by name."""
+    yield "suites", suites()
     yield "replay", replay()
     yield from steps()
     yield from sweeps()
@@ -96,6 +116,47 @@ def _read(bench: str, pattern: str = "") -> list[dict[str, Any]]:
     """Reads the records of a benchmark whose names match the pattern."""
     records = json.loads((RESULTS / "bench" / f"{bench}.json").read_text())
     return [one for name, one in sorted(records.items()) if re.search(pattern, name)]
+
+
+def completions() -> dict[tuple[str, str], dict[str, Any]]:
+    """Returns the completion of each suite and policy, pooled over records, seeds and parts, with
+    its 95 % interval."""
+    records = [*_read("benchmark"), *_read("push_suites")]
+    counts: dict[tuple[str, str], tuple[int, int]] = {}
+    for row in [row for record in records for row in record["results"]]:
+        for part in row.get("parts", {"": row}).values():
+            key, share = (row["suite"], row["policy"]), part["completion"]
+            done, episodes = counts.get(key, (0, 0))
+            done += round(share["value"] * share["n"])
+            counts[key] = done, episodes + share["n"]
+    return {key: metrics.wilson(*count) for key, count in counts.items()}
+
+
+def suites() -> Figure:
+    """Draws the completion of our policy in each suite between its floor and its ceiling."""
+    shares, places = completions(), range(len(OURS), 0, -1)
+    figure, panel = plt.subplots(figsize=(8, 4.6), layout="constrained")
+    floor, ceiling = (
+        [100 * shares[suite, bound[i]]["value"] for suite, bound in BOUNDS.items()] for i in (0, 1)
+    )
+    panel.hlines(places, floor, ceiling, color="lightgrey", linewidth=4, zorder=0)
+    panel.plot(floor, places, "o", color="grey", label="floor: random grasps")
+    panel.plot(
+        ceiling, places, "k|", markersize=14, label="ceiling: a planner that knows the scene"
+    )
+    ours = [shares[key] for key in OURS.items()]
+    value, low, high = (
+        100 * np.array([one[key] for one in ours]) for key in ("value", "low", "high")
+    )
+    style: dict[str, Any] = {"color": figures.PALETTE[2], "label": "ours, with its 95 % interval"}
+    panel.errorbar(value, places, xerr=(value - low, high - value), fmt="D", capsize=3, **style)
+    panel.axhline(len(OURS) - 3.5, color="black", linewidth=0.6)
+    panel.set_yticks(places, [f"{suite}: {policy}" for suite, policy in OURS.items()])
+    panel.set(xlabel="completed episodes, %", xlim=(-2, 102))
+    for place, text in ((len(OURS) - 1.5, "need pushes"), ((len(OURS) - 3) / 2, "need grasps")):
+        panel.text(104, place, text, rotation=270, ha="center", va="center")
+    figure.legend(loc="outside lower center", ncols=3, fontsize="small")
+    return figure
 
 
 def replay() -> Figure:

@@ -20,7 +20,7 @@ from csac_jax.render import episode, media, picture  # noqa: E402
 from csac_jax.render.picture import Viewpoint  # noqa: E402
 from csac_jax.runtime import cache  # noqa: E402
 from csac_jax.scenes import cases  # noqa: E402
-from csac_jax.world import model  # noqa: E402
+from csac_jax.world import blocks, model  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "pictures"
 SIZE = (960, 720)  # px
@@ -28,6 +28,11 @@ FINER = 2  # pixels drawn per pixel of a still, along each axis: gaps of 1 mm ar
 TOWARDS = np.array([-0.36, -0.7, 0.95])  # from what is shown to the camera
 ABOVE = 5.0  # m, where the hand is out of sight
 BLOCK = (-0.045, 0.045)  # m, about half of a long block, and a margin
+
+FREEING = 8  # seed of an episode of `enclosed`
+ARM = Viewpoint(position=(-0.42, -0.60, 0.48), look_at=(0.05, -0.02, 0.19), size=(720, 480))
+BLUE, YELLOW = map(blocks.COLOUR_NAMES.index, ("blue", "yellow"))  # of the others, of the target
+BETWEEN = 12  # pictures between two actions
 
 MOVING = (640, 480)  # px, of the scene in the animation
 PINWHEEL, PILE = 0, 0  # seeds of its two episodes
@@ -40,6 +45,7 @@ def main() -> None:
     cache.enable()
     for name in cases.names():
         media.write_picture(FOLDER / f"{name}.png", still(name))
+    write_animation(FOLDER / "freeing.webp", list(freeing()))
     write_animation(FOLDER / "clearing.webp", [*pinwheel(), *pile()])
 
 
@@ -79,6 +85,27 @@ def _smaller(image: np.ndarray) -> np.ndarray:
     return np.round(parts.mean(axis=(1, 3))).astype(np.uint8)
 
 
+def freeing() -> Iterator[tuple[np.ndarray, int]]:
+    """Yields pictures and times, ms: an arm pushes blocks apart and takes the yellow one."""
+    policy = policies.make("learned+planner", "shipped_target")
+    prepared = suites.prepare(policy.cfg, "enclosed", 1, FREEING, "c", "ur5e")
+    (env,) = prepared.parts.values()
+    steps = list(rollout.episode(env, policies.in_world(policy, env.cfg), FREEING))
+    print("enclosed", episode.summary(env, steps))
+    first, scene = steps[0].before, steps[0].before.scene
+    wanted = np.arange(len(scene.colour)) == scene.target
+    marked = first.replace(scene=scene.replace(colour=np.where(wanted, YELLOW, BLUE)))
+    stage = episode.EpisodeRenderer(env.cfg, marked, ARM.size, OPENGL, False, ARM)
+    motions = [stage.poses(step) for step in steps]
+    for poses, following in zip(motions, [*motions[1:], None], strict=True):
+        yield stage.draw(poses[0]), END_MS
+        yield from ((stage.draw(pose), FRAME_MS) for pose in poses[1:-1])
+        yield stage.draw(poses[-1]), END_MS
+        if following is not None:
+            moves = np.linspace(poses[-1], following[0], BETWEEN + 2)[1:-1]
+            yield from ((stage.draw(pose), FRAME_MS) for pose in moves)
+
+
 def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures and times, ms: the shipped policy takes the pinwheel apart."""
     return moving(str(cases.shipped("pinwheel")), PINWHEEL, every=2)
@@ -96,7 +123,7 @@ def moving(
     policy = policies.load("shipped")
     (env,) = suites.prepare(policy.cfg, suite, 1, seed, "c").parts.values()
     steps = list(rollout.episode(env, policy.replace(cfg=env.cfg), seed))
-    print(suite, episode.summary(env.cfg, steps))
+    print(suite, episode.summary(env, steps))
     yield from _pictures(env, steps, every, hold)
 
 

@@ -38,7 +38,7 @@ PAGES = [page for page in ALL if "```python" in page.read_text() and page not in
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 NUMBERS = re.compile(r"\b(episodes|seeds)\s*=\s*\d+")
 PROGRAMS = ("csac-jax", "make", "pip", "python", "jupyter", "source", "srun")
-WORDS = {"README.md": 1000, "CHANGELOG.md": 1500, "CONTRIBUTING.md": 900}
+WORDS = {"README.md": 900, "CHANGELOG.md": 1500, "CONTRIBUTING.md": 900}
 SENTENCE = 30  # most words
 names = pytest.mark.parametrize("page", ALL, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -329,7 +329,7 @@ def _sentences(page: Path) -> list[list[str]]:
 @names
 def test_pages_and_sentences_are_short(page: Path):
     """Claim: no sentence of README, CHANGELOG, CONTRIBUTING and docs has more than 30 words. README
-    has at most 1,000, CHANGELOG 1,500, CONTRIBUTING 900."""
+    has at most 900, CHANGELOG 1,500, CONTRIBUTING 900."""
     assert not [" ".join(words) for words in _sentences(page) if len(words) > SENTENCE]
     assert len(page.read_text().split()) <= WORDS.get(page.name, 5000)
 
@@ -394,30 +394,3 @@ def test_listed_policies_have_the_recorded_numbers(
     assert ("objects" in head) == cfg.scene.has_objects
     assert ("oblique" in head) == (cfg.heightmap.view == "oblique")
     assert f"hand {'any' if cfg.net.gripper else 'rg2'};" in head
-
-
-@pytest.mark.parametrize(
-    ("policy", "records"),
-    [
-        ("shipped", ["fast/shipped/seed-0/eval-random10-c.json"]),
-        (
-            "shipped_clutter",
-            [f"fast/clutter/seed-1/eval-{suite}-high.json" for suite in ("cases", "random30")],
-        ),
-        ("shipped_objects", ["objects/gpu_cones/seed-7/eval-pile.json"]),
-    ],
-)
-def test_readme_has_the_recorded_numbers(policy: str, records: list[str]):
-    """Claim: README's numbers of the shipped policies are those of the records."""
-    lines = README.read_text().splitlines()
-    rows = [row.split("|")[4:7] for row in lines if f"**{policy}**" in row]
-    for path, row in zip(records, rows, strict=True):
-        measured = json.loads(record(path))
-        parts = measured.get("parts", {"": measured}).values()
-        metrics = ("completion", "grasp_success", "action_efficiency")
-        for metric, cell in zip(metrics, row, strict=True):
-            shown = [float(number) for number in re.findall(r"[\d.]+", cell)]
-            per_cent = 100 if "%" in cell else 1
-            values = [per_cent * part[metric]["value"] for part in parts]
-            least = 0.0051 if per_cent == 1 else 0.06 if "." in cell else 0.5
-            assert [shown[0], shown[-1]] == pytest.approx([min(values), max(values)], abs=least)

@@ -15,7 +15,7 @@ import tyro
 from csac_jax.cli import output, settings
 from csac_jax.cli.failures import check_seed
 from csac_jax.errors import SettingsError
-from csac_jax.io import files
+from csac_jax.io import files, seal
 from csac_jax.runtime import modules, processes, signals
 from csac_jax.section import require
 
@@ -66,6 +66,8 @@ class EvalOptions:
     """With --out, share of the suites' own numbers of episodes, above 0, at most 1."""
     seed: int = 0
     """Number that scenes and noise follow from. No seed gives scenes of the training."""
+    name: str | None = None
+    """Name of the policy in tables; by default that of its source, or of a policy without one."""
     json: Path | None = None
     """File to write the result of a single suite to, as JSON."""
 
@@ -86,7 +88,7 @@ def run(arguments: list[str]) -> int:
         number = f"{result['episodes']} episodes, seed {options.seed}"
         print_summary(f"{options.policy} policy, {part}: {number}", summary)
     if options.json is not None:
-        files.write_json(options.json, result)
+        files.write_json(options.json, seal.seal(result))
     return 0
 
 
@@ -123,6 +125,13 @@ def _evaluate_sweep(options: EvalOptions, view: Any) -> int:
     return 0 if stopped is None else 128 + stopped
 
 
+def _name(options: EvalOptions) -> str:
+    """Returns the name of the policy in tables."""
+    source = Path(options.source).resolve().name.removesuffix(".safetensors")
+    learned = {"learned": source, "learned+planner": f"{source} + planner"}
+    return options.name or learned.get(options.policy, options.policy)
+
+
 def _policy(options: EvalOptions, changes: dict[str, Any]) -> tuple[Any, Any]:
     from csac_jax.evaluation import policies
 
@@ -154,11 +163,12 @@ def _measure(
     world = (options.seed, options.physics, options.robot, objects, options.split)
     prepared = suites.prepare(cfg, suite, episodes, *world, policies.is_learned(policy))
     table = rollout.evaluate(policy, prepared, on_progress=functools.partial(on_progress, suite))
-    asked = {"policy": options.policy, "which": options.which, "seed": options.seed}
+    asked = {"name": _name(options), "policy": options.policy, "which": options.which}
     has_library = any(env.cfg.scene.has_objects for env in prepared.parts.values())
     library = {"objects": prepared.cfg.scene.objects, "split": options.split}
     return {
         **asked,
+        "seed": options.seed,
         "suite": suite,
         "episodes": episodes,
         **(library if has_library else {}),
@@ -187,7 +197,7 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 
     def on_done(number: int, result: dict[str, Any]) -> None:
         suite = waiting[number]
-        files.write_json(paths[suite], {**result, "digest": tag})
+        files.write_json(paths[suite], seal.seal({**result, "digest": tag}))
         _write_table(out, paths)
         print(f"{suite}, {result['episodes']} episodes, {result['seconds']} s", flush=True)
 
@@ -239,7 +249,8 @@ def _is_kept(path: Path, episodes: int, tag: str) -> bool:
         result = files.read_object(path)
     except (FileNotFoundError, ValueError):
         return False
-    return (result.get("episodes"), result.get("digest")) == (episodes, tag)
+    asked = (result.get("episodes"), result.get("digest")) == (episodes, tag)
+    return asked and seal.is_intact(result)
 
 
 def _write_table(folder: Path, paths: dict[str, Path]) -> str:
@@ -281,14 +292,14 @@ def print_summary(title: str, summary: dict[str, Any]) -> None:
     from rich.table import Table
 
     from csac_jax.evaluation.statistics import Band
-    from csac_jax.report import result_tables
+    from csac_jax.report import cells
 
     caption = "in brackets: 95 % interval; action_efficiency: blocks per action"
     table = Table("metric", "value", "n", title=title, caption=caption)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
         if isinstance(entry, dict) and "value" in entry:
             band = Band(**entry) if entry["n"] else None
-            table.add_row(name, result_tables.shown(metric=name, band=band), str(entry["n"]))
+            table.add_row(name, cells.shown(metric=name, band=band), str(entry["n"]))
     console = Console(highlight=False)
     console.print(table)
     if "objects" in summary:

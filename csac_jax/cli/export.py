@@ -37,6 +37,9 @@ class ExportOptions(PolicyOptions):
     retry_temperature: float | None = None
     """Temperature of the draw of another place after failed grasps, see `csac-jax train
     --help-all`; by default as the policy's."""
+    card: tuple[Path, ...] = ()
+    """Results of `eval`, files or folders of them, for a model card, README.md beside the file. Its
+    head is the `model-index` that model hubs read; change the licence there if it is not yours."""
     input: Literal["maps", "image"] = "maps"
     """Input of a program: colour and height map, or (stablehlo) a camera's image and pose."""
     size: tuple[int, int] = (640, 480)
@@ -48,8 +51,10 @@ def run(arguments: list[str]) -> int:
     options = parsing.parse(ExportOptions, arguments, "export")
     _check(options)
     from csac_jax import deploy
-    from csac_jax.io import files, policy_file
+    from csac_jax.io import configs, files, policy_file
+    from csac_jax.report import model_card, results
 
+    evaluated = model_card.read(options.card) if options.card else []
     policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
     cfg = policy.cfg.change(policy=settings.decision(options))
     params = policy.params if options.average is None else _mean(policy.params, options.average)
@@ -58,6 +63,9 @@ def run(arguments: list[str]) -> int:
     else:
         files.replace(options.file, _program(options, cfg, params))
     print(f"wrote {options.file}, {options.file.stat().st_size} bytes")
+    if evaluated:
+        record = results.training_record(Path(options.policy), configs.to_dict(policy.cfg))
+        print(f"wrote {model_card.write(options.file, cfg, evaluated, record)}")
     return 0
 
 
@@ -65,6 +73,8 @@ def _check(options: ExportOptions) -> None:
     file, suffix = options.file, f".{options.format}"
     require(file.suffix == suffix, f"{file}: the name must end in {suffix}, see --format")
     require(not file.exists(), f"{file} exists; give another name")
+    beside = file.with_name("README.md")
+    require(not (options.card and beside.exists()), f"--card: {beside} exists; give another folder")
     fits = options.input == "maps" or options.format == "stablehlo"
     require(fits, "--input image: needs --format stablehlo")
     check_size(options.size)

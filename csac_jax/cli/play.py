@@ -20,9 +20,10 @@ class PlayOptions:
     """Runs one episode and prints the effect of every action."""
 
     scene: str = "random"
-    """Dropped blocks (random), a shipped case, a case file; pile, objects_packed or objects10."""
+    """Dropped blocks (random), a shipped case, a case file; or a suite of one part, such as
+    blocked, enclosed or tray, whose scenes need pushes, or pile, objects_packed or objects10."""
     objects: str | None = None
-    """Library of objects for the last three: a folder, or procedural:SEED:COUNT."""
+    """Library of suites of objects: a folder, or procedural:SEED:COUNT."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
@@ -54,7 +55,7 @@ def run(arguments: list[str]) -> int:
     if drawn:
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
-    env, steps = _play(options, _policy(options.policy), view)
+    env, steps = _play(options, _policy(options), view)
     from csac_jax.render import episode
 
     print(episode.summary(env, steps))
@@ -97,13 +98,15 @@ def _check(options: PlayOptions) -> None:
             check_extra("--video", "imageio_ffmpeg", "video")
 
 
-def _policy(source: str) -> Any:
-    """Returns the policy; one without networks has the config of `quick`."""
-    from csac_jax.evaluation import policies
+def _policy(options: PlayOptions) -> Any:
+    """Returns the policy; one without networks has the config of `quick`, and the scene's task."""
+    from csac_jax.evaluation import policies, suites
 
-    if source in policies.BASELINES:
-        return policies.BASELINES[source](presets.quick())
-    return policies.load(source)
+    if options.policy not in policies.BASELINES:
+        return policies.load(options.policy)
+    has_target = options.scene in suites.SUITES and suites.SUITES[options.scene].target
+    task = {"kind": "target"} if has_target else {}
+    return policies.BASELINES[options.policy](presets.quick().change(task=task))
 
 
 def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any, list[Any]]:
@@ -119,7 +122,8 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     world = (options.seed, options.physics, options.robot, options.objects)
     cfg, suite = policy.cfg.change(**view), _suite(options.scene)
     prepared = suites.prepare(cfg, suite, 1, *world, split="all")
-    (env,) = prepared.parts.values()
+    env, *others = prepared.parts.values()
+    require(not others, f"--scene: {options.scene} has several parts; give a suite of one part")
     # Quarter turns only, so that a case is recognised.
     env = dataclasses.replace(env, any_yaw=options.scene == "random")
     policies.warn_if_elsewhere(policy, env.cfg)
@@ -131,19 +135,17 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
 
 def _suite(scene: str) -> str:
-    """Returns the suite of one part with these scenes. Raises SettingsError if there is none."""
+    """Returns the suite with these scenes. Raises SettingsError if there is none."""
     from csac_jax.evaluation import suites
     from csac_jax.scenes import cases
 
     if scene == "random":
         return suites.IN_DISTRIBUTION
-    stocked = [name for name, one in suites.SUITES.items() if one.objects and not one.target]
-    stocked.remove("tight")  # of two parts
-    if scene in stocked:
+    if scene in suites.SUITES:
         return scene
     if scene in cases.names():
         return str(cases.shipped(scene))
     if Path(scene).is_file():
         return scene
-    known = ", ".join(("random", *cases.names(), *stocked))
+    known = ", ".join(dict.fromkeys(("random", *cases.names(), *suites.SUITES)))
     raise SettingsError(f"--scene: '{scene}' is neither a case file nor one of: {known}")

@@ -18,7 +18,7 @@ class ReportOptions:
     """Tables of recorded runs and evaluations over their seeds; needs no JAX."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Folders of runs, archives of them (.tar.xz), folders of these, and files of `eval --json`."""
+    """Folders of runs, archives of them (.tar.xz), folders of these, and files of `eval`."""
     out: Path | None = None
     """Page to write, a name in .html, with curves, pictures and videos, or a folder for the page
     and its tables as Markdown; needs the extra `report`."""
@@ -43,7 +43,7 @@ def run(arguments: list[str]) -> int:
     from csac_jax.report import comparison, result_tables, results
 
     recorded = results.read(options.runs)
-    if not (recorded.runs or recorded.evaluations):
+    if not (recorded.runs or recorded.evaluations or recorded.suites):
         raise FailedError("; ".join(recorded.notes))
     report = comparison.build(recorded, options.reference)
     text = result_tables.markdown(report)

@@ -1,8 +1,10 @@
-"""`csac-jax serve`: a policy as an HTTP service."""
+"""`csac-jax serve`: a policy as an HTTP service, or as tools of the Model Context Protocol."""
 
 import dataclasses
 import shlex
 from pathlib import Path
+
+import tyro
 
 from csac_jax.cli import parsing
 from csac_jax.cli.failures import check_extra
@@ -26,11 +28,16 @@ class ServeOptions(RobotOptions):
     """File whose first line clients must send as the header Authorization: Bearer LINE."""
     size: tuple[int, int] = (640, 480)
     """Width and height of the images, px, to compile for at the start; others compile later."""
+    mcp: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Serve the tools decide, policies and evaluate on stdin and stdout instead, by the Model
+    Context Protocol (extra `mcp`)."""
 
 
 def run(arguments: list[str]) -> int:
     """Serves until it is stopped; returns the exit code."""
     options = parsing.parse(ServeOptions, arguments, "serve")
+    if options.mcp:
+        return _serve_tools(options)
     for module in ("fastapi", "uvicorn"):
         check_extra("serve", module, "serve")
     token = _token(options)
@@ -45,6 +52,15 @@ def run(arguments: list[str]) -> int:
         app = service.make(policy, options.policy, token, recorder, options.size)
         print(_usage(options, listener.getsockname()[1]), flush=True)
         server.configured(app).run(sockets=[listener])
+    return 0
+
+
+def _serve_tools(options: ServeOptions) -> int:
+    check_extra("--mcp", "mcp", "mcp")
+    require(options.record is None, "--record: --mcp records nothing; leave one of them out")
+    from csac_jax.cli import mcp_tools
+
+    mcp_tools.make(options.load()).run("stdio")
     return 0
 
 

@@ -157,7 +157,8 @@ def parse_view(
         kinds[name] = _some(kind, some or names(kind), "(default: the policy's)")
     given = parsing.parse(_with_sections(options, kinds), flags, command)
     named = {flag.split("=")[0].replace("-", "_") for flag in flags}
-    return given, {
+    plain = {field.name: getattr(given, field.name) for field in dataclasses.fields(options)}
+    return options(**plain), {  # whose class has a module, so that a process of its own takes it
         name: {k: v for k, v in vars(getattr(given, name)).items() if f"__{name}.{k}" in named}
         for name in VIEW
     }

@@ -91,11 +91,11 @@ def run(arguments: list[str]) -> int:
 
 def _report(result: Any) -> None:
     from csac_jax.evaluation.statistics import Band
-    from csac_jax.report import result_tables
+    from csac_jax.report import cells
 
     for point in result.summary["settings"]:
         band = Band(**point["grasp_success"])
-        success = result_tables.shown(metric="grasp_success", band=band) if band.n else "unknown"
+        success = cells.shown(metric="grasp_success", band=band) if band.n else "unknown"
         print(f"{point['name']}: grasp success {success}, interquartile mean of {band.n} seeds")
 
 

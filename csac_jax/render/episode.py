@@ -36,14 +36,21 @@ class EpisodeRenderer:
     """Renderer of an episode's scene, in colour."""
 
     def __init__(
-        self, cfg: Config, first: State, size: tuple[int, int], opengl: str | None, views: bool
+        self,
+        cfg: Config,
+        first: State,
+        size: tuple[int, int],
+        opengl: str | None,
+        views: bool,
+        viewpoint: Viewpoint | None = None,
     ) -> None:
         self._cfg, self._height, self._views = cfg, size[1], views
         self._world = model.build(cfg.scene, cfg.sim)
         self._fields = jax.device_get(model.scene_fields(self._world, first.scene))
         self._model = picture.coloured(self._world, self._fields, first.scene)
         self._data = mujoco.MjData(self._model)
-        self._draw = picture.renderer(self._model, VIEWS[cfg.sim.robot]._replace(size=size), opengl)
+        self._viewpoint = (viewpoint or VIEWS[cfg.sim.robot])._replace(size=size)
+        self._draw = picture.renderer(self._model, self._viewpoint, opengl)
 
     def still(self, step: StepRecord, text: str) -> np.ndarray:
         """Draws the scene before an action, the robot at its start: [H, W, 3] uint8."""
@@ -54,7 +61,7 @@ class EpisodeRenderer:
         image, frame, action = self._start(step), self._frame(step), text.split(":")[0]
         yield frame(image, action)
         for pose in self.poses(step):
-            image = self._picture(pose)
+            image = self.draw(pose)
             yield frame(image, action)
         yield from [frame(image, text)] * (HOLD if self._views else 0)
 
@@ -67,20 +74,21 @@ class EpisodeRenderer:
     def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
         """Shows the steps in a viewer, see `viewer.play`."""
         actions = [(line(number, step), self.poses(step)) for number, step in enumerate(steps, 1)]
-        viewer.play(self._model, actions, log, again)
+        viewer.play(self._model, actions, log, again, self._viewpoint)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()
         pose[self._world.robot_qpos] = step.joints.start
         pose[self._world.block_qpos] = np.concatenate([scene.position, scene.quaternion], axis=1)
-        return self._picture(pose)
+        return self.draw(pose)
 
     def _frame(self, step: StepRecord) -> panels.Frame:
         if self._views:
             return panels.frame(self._cfg, step, self._height)
         return lambda scene, text: scene
 
-    def _picture(self, pose: np.ndarray) -> np.ndarray:
+    def draw(self, pose: np.ndarray) -> np.ndarray:
+        """Draws a pose, qpos [...]: [H, W, 3] uint8."""
         self._data.qpos[:] = pose
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)

@@ -66,13 +66,9 @@ def _opengl_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
     _light(model)
     opengl = mujoco.Renderer(model, *reversed(view.size))
     opengl.scene.flags[mujoco.mjtRndFlag.mjRND_CULL_FACE] = 0  # the sky is seen from inside
-    eye, offset = mujoco.MjvCamera(), np.array(view.look_at) - np.array(view.position)
-    eye.lookat[:] = view.look_at
-    eye.distance = np.linalg.norm(offset)
-    eye.azimuth = np.degrees(np.arctan2(offset[1], offset[0]))
-    eye.elevation = np.degrees(np.arcsin(offset[2] / eye.distance))
+    aim(eye := mujoco.MjvCamera(), view)
     options, sphere = mujoco.MjvOption(), mujoco.mjtGeom.mjGEOM_SPHERE
-    options.geomgroup[:] = 1
+    options.geomgroup[:], options.sitegroup[:] = 1, 0
 
     def draw(data: mujoco.MjData) -> np.ndarray:
         opengl.update_scene(data, eye, options)
@@ -83,6 +79,14 @@ def _opengl_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
         return opengl.render().copy()
 
     return draw
+
+
+def aim(eye: Any, view: Viewpoint) -> None:
+    """Places a camera of MuJoCo at a viewpoint."""
+    offset = np.array(view.look_at) - np.array(view.position)
+    eye.lookat[:], eye.distance = view.look_at, np.linalg.norm(offset)
+    eye.azimuth = np.degrees(np.arctan2(offset[1], offset[0]))
+    eye.elevation = np.degrees(np.arcsin(offset[2] / eye.distance))
 
 
 def _light(model: mujoco.MjModel) -> None:

@@ -13,8 +13,10 @@ import mujoco
 import numpy as np
 
 from csac_jax.objects import descriptions
-from csac_jax.render import gl, media
+from csac_jax.render import gl, media, picture
+from csac_jax.render.picture import Viewpoint
 
+ABOVE = Viewpoint(position=(-0.4, -0.4, 0.45), look_at=(0.0, 0.0, 0.03))
 PORT = 8080  # of the page, or the next free one
 CLOSING = 10.0  # s that a window may take to close
 _PLANE = 1.0  # half side of an endless plane as drawn, m
@@ -29,10 +31,11 @@ def play(
     actions: Sequence[tuple[str, np.ndarray]],
     log: Callable[[str], None],
     again: bool = True,
+    view: Viewpoint = ABOVE,
 ) -> None:
     """Shows actions, texts and qpos [T, ...], again and again until closed or by Ctrl-C."""
     frames = [(text, pose) for text, poses in actions for pose in poses]
-    opened = _window(model) if gl.has_display() else _page(model, len(frames), log)
+    opened = _window(model, view) if gl.has_display() else _page(model, len(frames), log, view)
     data, number = mujoco.MjData(model), 0
     with contextlib.suppress(KeyboardInterrupt), opened as show:
         while again or number < len(frames):
@@ -47,7 +50,7 @@ def play(
 
 
 @contextlib.contextmanager
-def _window(model: mujoco.MjModel) -> Iterator[Show]:
+def _window(model: mujoco.MjModel, view: Viewpoint) -> Iterator[Show]:
     import mujoco.viewer
 
     shown, others = mujoco.MjData(model), set(threading.enumerate())
@@ -62,8 +65,7 @@ def _window(model: mujoco.MjModel) -> Iterator[Show]:
     panels = {"show_left_ui": False, "show_right_ui": False}
     try:
         with mujoco.viewer.launch_passive(model, shown, **panels) as handle:
-            handle.cam.lookat[:], handle.cam.distance = (0.0, 0.0, 0.05), 1.2
-            handle.cam.azimuth, handle.cam.elevation = 45.0, -35.0
+            picture.aim(handle.cam, view)
             yield show
     finally:
         for thread in set(threading.enumerate()) - others:
@@ -73,12 +75,14 @@ def _window(model: mujoco.MjModel) -> Iterator[Show]:
 class Page:
     """A scene of viser with the visible geoms of a model, and controls of `pictures` pictures."""
 
-    def __init__(self, server: Any, model: mujoco.MjModel, pictures: int) -> None:
+    def __init__(
+        self, server: Any, model: mujoco.MjModel, pictures: int, view: Viewpoint = ABOVE
+    ) -> None:
         server.scene.set_up_direction("+z")
 
         @server.on_client_connect
         def _(client: Any) -> None:
-            client.camera.position, client.camera.look_at = (-0.4, -0.4, 0.45), (0.0, 0.0, 0.03)
+            client.camera.position, client.camera.look_at = view.position, view.look_at
 
         self._text = server.gui.add_markdown("")
         self.playing = server.gui.add_checkbox("play", True)
@@ -119,13 +123,15 @@ class Page:
 
 
 @contextlib.contextmanager
-def _page(model: mujoco.MjModel, pictures: int, log: Callable[[str], None]) -> Iterator[Show]:
+def _page(
+    model: mujoco.MjModel, pictures: int, log: Callable[[str], None], view: Viewpoint
+) -> Iterator[Show]:
     import viser
 
     server = viser.ViserServer(host="127.0.0.1", port=PORT, verbose=False)
     log(f"open http://127.0.0.1:{server.get_port()} in a browser; Ctrl-C ends")
     try:
-        yield Page(server, model, pictures).show
+        yield Page(server, model, pictures, view).show
     finally:
         server.stop()
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from csac_jax.constants import GRASP_WINDOW
 from csac_jax.evaluation import statistics
-from csac_jax.evaluation.metrics import PER_ACTION, PER_EPISODE
+from csac_jax.evaluation.metrics import PER_EPISODE
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import comparison
+from csac_jax.report import comparison, suite_table
+from csac_jax.report.cells import ResultTable, shown, table_text
 from csac_jax.report.comparison import Curve, ResultReport, Score, compared
 from csac_jax.report.results import METRICS, RecordedRun
 from csac_jax.report.variants import Json, Variant, label, train_command
@@ -40,8 +41,6 @@ EXPLAINED = (
     "A method with many changed settings has the name of its folder; its command stands under "
     "provenance."
 )
-
-ResultTable = list[dict[str, str]]  # rows; column -> cell
 
 
 def first_good(run: RecordedRun, column: np.ndarray) -> float | None:
@@ -117,6 +116,7 @@ def tables(report: ResultReport) -> dict[str, ResultTable]:
     titled = {
         "Summary": [{name: row[name] for name in SUMMARY} for row in plain],
         "Training": trained,
+        "Suites": suite_table.merged(report.results.suites),
         "Evaluation": evaluation(report),
         "Differences in training": training_differences(report),
         "Differences": differences(report),
@@ -255,30 +255,9 @@ def _wall_time(record: Json) -> str:
     return "-" if seconds is None else f"{seconds:.0f} s{whole}"
 
 
-def shown(band: Band | None, sign: str = "", metric: str = "") -> str:
-    """Formats a band as blocks per action, counts per episode or per cent; with a sign as a
-    difference, in points."""
-    if band is None:
-        return "-"
-    if metric in (*PER_ACTION, *PER_EPISODE):
-        scale, digits, unit = 1, 3 if metric in PER_ACTION else 2, ""
-    else:
-        scale, digits, unit = 100, 1, "" if sign else " %"
-    value, *ends = (f"{scale * x:{sign}.{digits}f}" for x in band[:3] if x is not None)
-    return f"{value}{unit} ({' to '.join(ends)})" if ends else f"{value}{unit}"
-
-
 def markdown(report: ResultReport) -> str:
     """Writes all tables and notes as Markdown."""
     sections = {title: table_text(table) for title, table in tables(report).items()}
     if report.notes:
         sections["Notes"] = "\n".join(f"- {note}" for note in report.notes)
     return "\n\n".join([EXPLAINED, *(f"## {t}\n\n{text}" for t, text in sections.items())]) + "\n"
-
-
-def table_text(table: Sequence[Mapping[str, str]]) -> str:
-    """Writes a table as Markdown."""
-    rows = [list(table[0]), *(list(row.values()) for row in table)]
-    lines = ["| " + " | ".join(cell.replace("|", "/") for cell in row) + " |" for row in rows]
-    lines.insert(1, "|" + "---|" * len(table[0]))
-    return "\n".join(lines)

@@ -1,7 +1,7 @@
 """Recorded runs and evaluations, read from folders and archives without JAX.
 
 A run is a folder with `metrics.jsonl` and `config.json`. An evaluation is a JSON file that
-`csac-jax eval --json` wrote. Other files are skipped.
+`csac-jax eval` wrote. A record is a file of experiments/results/bench. Other files are skipped.
 """
 
 import contextlib
@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from csac_jax import reading
-from csac_jax.errors import SettingsError
-from csac_jax.io import files, renames
+from csac_jax.errors import FailedError, SettingsError
+from csac_jax.io import files, renames, seal
 from csac_jax.report import variants
 from csac_jax.report.variants import Json, Variant
 from csac_jax.section import require, shown
@@ -48,8 +48,9 @@ _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "rob
 _RECORD = {"device": _TEXT, "versions": dict | None, "commit": _TEXT, "wall_seconds": _NUMBER}
 _RECORD["modules"] = dict | None
 _COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
-_METRICS = {**dict.fromkeys(METRICS, _SHARE), "counts": _COUNTS}
+_METRICS = {**dict.fromkeys((*METRICS, "declutter_rate"), _SHARE), "counts": _COUNTS}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "config": _CONFIG, "parts": {}}
+_EVALUATION |= {"name": str, "episodes": int, "sha256": str}
 
 
 class RecordedRun(NamedTuple):
@@ -93,20 +94,23 @@ class Results(NamedTuple):
     runs: list[RecordedRun]
     evaluations: list[Evaluation]
     notes: list[str]
+    suites: Sequence[Json] = ()  # evaluations with a digest, and those of records
 
 
 def read(paths: Iterable[Path]) -> Results:
     """Reads folders, files and archives; of a folder also the archives that lie directly in it.
-    Raises SettingsError for a path that is none of them."""
-    results = Results([], [], [])
+    Raises SettingsError for a path that is none of them, FailedError for an evaluation that does
+    not fit its digest."""
+    suites: list[Json] = []
+    results = Results([], [], [], suites)
     for path in paths:
         archives = sorted(path.glob(f"*{ARCHIVE}")) if path.is_dir() else []
-        before = len(results.runs) + len(results.evaluations)
+        before = len(results.runs) + len(results.evaluations) + len(suites)
         for source in (path, *archives):
             with _opened(source) as folder:
                 for file in _files(folder):
-                    _add(file, source / file.relative_to(folder), results)
-        if len(results.runs) + len(results.evaluations) == before:
+                    _add(file, source / file.relative_to(folder), results, suites)
+        if len(results.runs) + len(results.evaluations) + len(suites) == before:
             results.notes.append(f"{path}: holds no {files.METRICS} and no result of `eval --json`")
     results.notes.extend(_without_evaluation(results))
     return results
@@ -152,13 +156,19 @@ def _files(path: Path) -> Iterator[Path]:
                 yield Path(folder, name)
 
 
-def _add(file: Path, path: Path, results: Results) -> None:
+def _add(file: Path, path: Path, results: Results, suites: list[Json]) -> None:
     """Adds the content of a file under the name `path`, or a note that it is damaged."""
     try:
         if file.name == files.METRICS:
             _add_run(file, path, results)
-        else:
-            results.evaluations.extend(_evaluations(file, path))
+            return
+        content = files.parse(reading.read_bytes(file, files.LARGEST_JSON), "the file")
+        found = _evaluations(content, file, path) if isinstance(content, dict) else []
+        results.evaluations.extend(found)
+        if found and seal.SHA256 in content:
+            suites.append(_intact(content, path))
+        elif not found and isinstance(content, dict):
+            suites.extend(_recorded(content))
     except (OSError, ValueError) as error:
         results.notes.append(f"{path}: damaged ({files.first_line(error)}); left out")
 
@@ -202,7 +212,7 @@ def _add_run(file: Path, path: Path, results: Results) -> None:
         return
     names = ("actions", "grasp_success", "grasps_counted", "seconds")
     columns = [np.array([line[name] for line in grasped], float) for name in names]
-    record = {"wall_seconds": float(columns[-1][-1]), **_record(file.parent, config)}
+    record = {"wall_seconds": float(columns[-1][-1]), **training_record(file.parent, config)}
     fields = (path, config, _variant(file, path, config), *columns, record, _totals(lines))
     results.runs.append(RecordedRun._make(fields))
 
@@ -214,21 +224,38 @@ def _totals(lines: Sequence[Json]) -> dict[str, int]:
     return {name: sum(row[name] for row in rows) for name in names}
 
 
-def _record(folder: Path, config: Json) -> Json:
-    """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it."""
+def training_record(folder: Path, config: Json) -> Json:
+    """Reads what `train` wrote in this folder, or `sweep` above a `seed-K`; empty without it or for
+    another config."""
     above = Path(os.path.realpath(folder)).parents[:2] if folder.name.startswith("seed-") else ()
     for place in (folder, *above):
         record = _read_json(place / files.RECORD)
         _check(record, _RECORD, files.RECORD)
-        if record and renames.current(record.get("config", config)) == config:
+        stored = record.get("config", config)
+        if record and isinstance(stored, dict) and renames.current(stored) == config:
             return record
     return {}
 
 
-def _evaluations(file: Path, path: Path) -> list[Evaluation]:
-    content = files.parse(reading.read_bytes(file, files.LARGEST_JSON), "the file")
+def _intact(content: Json, path: Path) -> Json:
+    if not seal.is_intact(content):
+        fault = "was changed after it was measured: its sha256 does not fit"
+        raise FailedError(f"{path}: {fault}; measure it again or leave it out")
+    return content
+
+
+def _recorded(content: Json) -> Iterator[Json]:
+    """Yields the evaluations in a benchmark's records, by their suites and parts."""
+    records = [one.get("results") for one in content.values() if isinstance(one, dict)]
+    for row in [row for rows in records if isinstance(rows, list) for row in rows]:
+        if isinstance(row, dict) and row.keys() >= {"suite", "policy", "episodes", "seed"}:
+            _check_part(row)
+            yield {**row, "parts": {row["part"]: row}} if "part" in row else row
+
+
+def _evaluations(content: Json, file: Path, path: Path) -> list[Evaluation]:
     kinds = [{"policy", "config", name} for name in ("parts", "grasp_success")]
-    if not isinstance(content, dict) or not any(kind <= content.keys() for kind in kinds):
+    if not any(kind <= content.keys() for kind in kinds):
         return []
     _check(content, _EVALUATION, "the file")
     suite = str(renames.METRICS.get(content.get("suite", "own"), content.get("suite")))
@@ -248,7 +275,7 @@ def _evaluations(file: Path, path: Path) -> list[Evaluation]:
 
 def _check_part(part: Any) -> None:
     _check(part, _METRICS, "a part")
-    shares = [part[name] for name in METRICS if part.get(name)]
+    shares = [part[name] for name in (*METRICS, "declutter_rate") if part.get(name)]
     if not all(_SHARE.keys() <= share.keys() for share in shares):
         raise ValueError("a share lacks its interval")
 

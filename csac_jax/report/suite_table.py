@@ -1,11 +1,13 @@
 """A table of evaluations, suite by suite."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from csac_jax.evaluation.statistics import Band
-from csac_jax.report import result_tables
+from csac_jax.io import seal
+from csac_jax.report import cells
+from csac_jax.report.cells import ResultTable
 
 METRICS = {
     "grasp_success": "grasp success",
@@ -13,31 +15,57 @@ METRICS = {
     "declutter_rate": "objects taken",
     "action_efficiency": "objects per action",
 }
+HEAD = ("suite", "policy", "episodes", *METRICS.values())
 Row = tuple[str, ...]
+Json = dict[str, Any]
 
 
-def rows(results: Iterable[dict[str, Any]]) -> list[Row]:
+def rows(results: Iterable[Json]) -> list[Row]:
     """Builds a row for each part of each result of `csac-jax eval`: suite, policy, episodes and
     METRICS."""
-    table = []
-    for result in results:
-        suite = Path(result["suite"]).stem
-        for part, summary in result.get("parts", {suite: result}).items():
-            bands = [Band(**entry) if entry["n"] else None for entry in map(summary.get, METRICS)]
-            name = part if part == suite else f"{suite}, {part}"
-            table.append((name, result["policy"], str(result["episodes"]), *shown(bands)))
-    return table
+    return [_row(result, *part) for result in results for part in parts(result)]
+
+
+def merged(results: Iterable[Json]) -> ResultTable:
+    """Merges results of several policies suite by suite, what completes most first. A result that
+    is given twice counts once."""
+    each = {one.get(seal.SHA256, id(one)): one for one in results}.values()
+    entries = [(result, *part) for result in each for part in parts(result)]
+    entries.sort(key=lambda entry: (entry[1], -_completion(entry[2])))
+    return [
+        dict(zip(HEAD, _row(*entry), strict=True))
+        | {"seed": str(entry[0].get("seed", "-")), "sha256": entry[0].get(seal.SHA256, "-")[:12]}
+        for entry in entries
+    ]
+
+
+def parts(result: Json) -> Iterator[tuple[str, Json]]:
+    """Yields the name of each part, with that of its suite, and its metrics."""
+    suite = Path(str(result["suite"])).stem
+    for part, summary in result.get("parts", {suite: result}).items():
+        yield part if part == suite else f"{suite}, {part}", summary
+
+
+def _completion(summary: Json) -> float:
+    return (summary.get("completion") or {}).get("value") or 0.0
+
+
+def _row(result: Json, name: str, summary: Json) -> Row:
+    policy = " ".join(str(result.get("name", result["policy"])).split())
+    return name, policy, str(result["episodes"]), *shown(_band(summary.get(one)) for one in METRICS)
+
+
+def _band(share: Json | None) -> Band | None:
+    known = share is not None and share["n"] and share["value"] is not None
+    return Band(*(share[key] for key in Band._fields)) if share and known else None
 
 
 def shown(bands: Iterable[Band | None]) -> list[str]:
     """Formats a band of each of METRICS; a dash where there is none."""
-    return [
-        result_tables.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)
-    ]
+    return [cells.shown(band, metric=name) for band, name in zip(bands, METRICS, strict=True)]
 
 
 def markdown(table: Iterable[Row]) -> str:
     """Writes rows as a Markdown table."""
-    head = ("suite", "policy", "episodes", *METRICS.values())
-    named = [dict(zip(head, row, strict=True)) for row in table]
-    return f"{result_tables.table_text(named)}\n\nIn brackets: 95 % intervals.\n"
+    named = [dict(zip(HEAD, row, strict=True)) for row in table]
+    return f"{cells.table_text(named)}\n\nIn brackets: 95 % intervals.\n"

@@ -1,6 +1,7 @@
 """`csac-jax eval` over several suites."""
 
 import json
+import pickle
 import re
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 import pytest
 
 from csac_jax import cli
-from csac_jax.cli import evaluate
+from csac_jax.cli import evaluate, settings
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.report import suite_table
@@ -40,7 +41,7 @@ def test_suites_are_measured_once(
     tmp_path: Path, measured: list[tuple[str, int]], capsys: pytest.CaptureFixture
 ):
     """Claim: an evaluation that was stopped goes on where it was; another share, other settings and
-    a damaged result are measured again; the table has all suites."""
+    a damaged or changed result are measured again; the table has all suites."""
     out = tmp_path / "out"
     command = ["eval", "shipped", "--policy", "random", "--out", str(out), "--jobs", "1"]
     both = [*command, "--suites", "cases", "random10", "--share", "0.01"]
@@ -58,6 +59,25 @@ def test_suites_are_measured_once(
     (out / "cases.json").write_text('{"suite": "ca')
     assert cli.main([*both, *change]) == 0
     assert [suite for suite, _ in measured[before:]] == ["cases"]
+    changed = (out / "cases.json").read_text().replace('"seconds": 0.1', '"seconds": 0.2')
+    (out / "cases.json").write_text(changed)
+    assert cli.main([*both, *change]) == 0
+    assert [suite for suite, _ in measured[before + 1 :]] == ["cases"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [
+        ("shipped_clutter", "shipped_clutter"),
+        ("runs/my.safetensors --policy learned+planner", "my + planner"),
+        ("shipped --policy random", "random"),
+        ("runs/first --name mine", "mine"),
+    ],
+)
+def test_a_result_names_its_policy(flags: str, name: str):
+    """Claim: in tables a policy has the name of its source, of what acts without one, or --name."""
+    options, _ = settings.parse_view(evaluate.EvalOptions, "eval", flags.split())
+    assert evaluate._name(options) == name
 
 
 def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
@@ -109,7 +129,8 @@ def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
 
 
 def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: each suite is measured with the modules of --import, in a process of its own too."""
+    """Claim: each suite is measured with the modules of --import, in a process of its own too, to
+    which its options can be sent."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
     Path("my_empty.py").write_text("")
@@ -124,6 +145,7 @@ def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert cli.main(["eval", "shipped", *flags, "--import", "my_empty"]) == 130
     assert all("my_empty" in task[-1] for task in tasks)
     assert len(tasks) == 2
+    assert pickle.loads(pickle.dumps(tasks)) == tasks
     options, changes, suite, episodes, _ = tasks[0]
     with pytest.raises(SettingsError, match="'no_module' cannot be imported"):
         evaluate._measure(lambda *_: None, options, changes, suite, episodes, ("no_module",))

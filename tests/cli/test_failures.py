@@ -98,6 +98,7 @@ def test_usage_and_version(capsys: pytest.CaptureFixture):
     [
         ("train smoke --log tensorboard wandb", "--log tensorboard", "tensorboard"),
         ("report . --out page", "--out", "report"),
+        ("serve shipped --mcp", "--mcp", "mcp"),
         ("play --viewer", "--viewer: there is no display here, and its page", "viewer"),
     ],
 )

@@ -424,6 +424,8 @@ def _records(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     record = {"wall_seconds": 3.0, "config": config, "device": "cpu", "versions": {"jax": "1"}}
     valid = {"eval.json": evaluation, files.CONFIG: config, files.RECORD: record}
     valid[files.METRICS] = json.loads(_line(3))
+    row = {**part, "suite": "cases", "policy": "a", "episodes": 10, "seed": 0}
+    valid["record.json"] = {"cpu": {"results": [row, {**row, "part": "b"}]}}
     for name, content in valid.items():
         own = folder / name
         for other in valid:

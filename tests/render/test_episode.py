@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from csac_jax import cli, presets
+from csac_jax.cli import play
 from csac_jax.env import Env
 from csac_jax.render import episode, gl
 from csac_jax.world import scene_state
@@ -108,6 +109,7 @@ def _is_red(image: np.ndarray) -> np.ndarray:
     ("arguments", "code", "message"),
     [
         ("--scene nowhere", 2, "--scene: 'nowhere' is neither a case file nor one of: random"),
+        ("--scene cases", 2, "--scene: cases has several parts"),
         ("--size 95 64", 2, "--size: both numbers must be even"),
         ("--policy nowhere", 1, "there is no folder nowhere"),
         ("--png a.txt", 2, "a.txt: its name must end in"),
@@ -123,6 +125,13 @@ def test_bad_arguments_are_one_line(
     assert message in captured.err
     assert captured.err.count("\n") == 1
     assert captured.out == ""
+
+
+@pytest.mark.parametrize(("scene", "kind"), [("enclosed", "target"), ("blocked", "clear")])
+def test_policies_without_networks_have_the_task_of_the_scene(scene: str, kind: str):
+    """Claim: the planner gets the marked block in a suite that marks one, else it clears."""
+    policy = play._policy(play.PlayOptions(scene=scene, policy="planner"))
+    assert policy.cfg.task.kind == kind
 
 
 def test_video_without_the_extra_names_it(here, capsys, monkeypatch: pytest.MonkeyPatch):

@@ -28,8 +28,8 @@ model = mujoco.MjModel.from_xml_string(
 poses = [np.array([0, 0, z, 1, 0, 0, 0]) for z in (0.1, 0.2, 0.3)]
 seen, window = [], viewer._window
 @contextlib.contextmanager
-def counted(model):
-    with window(model) as show:
+def counted(*of):
+    with window(*of) as show:
         yield lambda data, *of: (seen.append(float(data.xpos[1, 2])), show(data, *of))[1]
 viewer._window = counted
 viewer.play(model, [("up", poses)], print, again=False)

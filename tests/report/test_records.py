@@ -29,6 +29,26 @@ def test_pages_are_as_written():
     assert {run.config["seed"] for run in runs} <= set(range(100, 150))
 
 
+def test_figure_of_suites_has_the_recorded_numbers():
+    """Claim: README's figure has the completion of its floor, policy and ceiling of every suite, as
+    the page on suites that need pushes; README's shares with and without pushes are recorded."""
+    shares = figures.completions()
+    page = (ROOT / "docs" / "benchmarks" / "policies.md").read_text()
+    for suite, (floor, ceiling) in [*figures.BOUNDS.items()][:3]:
+        names = (floor, ceiling, figures.OURS[suite])
+        values = [f"{100 * shares[suite, name]['value']:.0f}" for name in names]
+        (row,) = re.findall(rf"(?m)^\| {suite} \|(.*)\|$", page)
+        cells = [(cell.split() or ["-"])[0] for cell in row.split("|")]
+        assert [cells[0], cells[-1]] == values[:2]
+        assert values[2] in cells
+    bars = figures.suites().axes[0].get_lines()
+    drawn = [line.get_xdata().tolist() for line in bars if line.get_linestyle() == "None"][:2]
+    assert [len(values) for values in drawn] == [len(figures.OURS)] * 2
+    pushes = [shares["enclosed", name]["value"] for name in ("pushes", "pushes, grasps only")]
+    text = "completes {:.0f} % with pushes, {:.0f} % without".format(*(100 * x for x in pushes))
+    assert text in (ROOT / "README.md").read_text()
+
+
 def test_study_counts_actions_until_nine_of_ten_grasps_lift():
     """Claim: "actions to 90 %" are the interquartile mean over seeds of the actions at which nine
     of ten of the last 200 grasps first had lifted; a run that never gets there counts whole."""

@@ -1,6 +1,7 @@
 """`csac-jax report` from recorded files to tables, figures and page."""
 
 import base64
+import hashlib
 import json
 import os
 import re
@@ -21,11 +22,12 @@ from csac_jax import algorithms, cli, presets
 from csac_jax.cli import settings, train
 from csac_jax.cli.evaluate import EvalOptions
 from csac_jax.evaluation import metrics, statistics
-from csac_jax.io import configs, files
+from csac_jax.io import configs, files, seal
 from csac_jax.report import comparison, figures, result_tables, results, variants
 from csac_jax.report.comparison import ResultReport
 
 CASES = ("hole", "row")
+PUSHES = Path(__file__).parents[2] / "experiments" / "results" / "bench" / "push_suites.json"
 MANY = {"net__head": 16, "learn__batch": 4, "learn__tau": 0.5, "cem__rounds": 1}
 MANY |= {"learn__updates_per_step": 9, "target__gamma": 0.1, "train__actions": 90}
 
@@ -393,6 +395,50 @@ def test_options_of_an_evaluation(trained: Any, evaluated: Any, options: str | N
         assert configs.to_dict(configs.from_dict(before).change(**view)) == seen
     if evaluated is TWO:
         assert (parsed.objects, parsed.split) == ("procedural:2:9", "all")
+
+
+def _entry(path: Path, name: str, completed: int) -> None:
+    """Writes what `eval --out` does for a suite, with its digest."""
+    share = metrics.wilson(completed, 10)
+    content = {"policy": "learned", "name": name, "suite": "blocked", "seed": 0, "episodes": 10}
+    content |= dict.fromkeys(results.METRICS, share) | {"config": _config("csac_beta", 0)}
+    files.write_json(path, seal.seal(content))
+
+
+def test_results_of_others_are_one_table(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: results with digests and a benchmark's record make one table by suite and policy, what
+    completes most first, each result once. One that was changed is refused in one line."""
+    mine, theirs = tmp_path / "mine", tmp_path / "theirs"
+    for folder, completed in ((mine, 8), (theirs, 5)):
+        _entry(folder / "blocked.json", folder.name, completed)
+    command = ["report", str(mine), str(theirs), str(theirs), str(PUSHES)]
+    assert cli.main(command) == 0
+    table = re.search(r"## Suites\n\n(.*?)\n\n", capsys.readouterr().out, re.DOTALL)
+    assert table is not None
+    cells = [[cell.strip() for cell in row.split("|")] for row in table[1].splitlines()]
+    names = [row[2] for row in cells if row[1] == "blocked"]
+    assert names.count("theirs") == 1
+    assert names.index("planner") < names.index("mine") < names.index("theirs")
+    assert names.index("theirs") < names.index("random")
+    digest = json.loads((mine / "blocked.json").read_text())["sha256"]
+    assert [row[9] for row in cells if row[2] == "mine"] == [digest[:12]]
+    text = (mine / "blocked.json").read_text()
+    (mine / "blocked.json").write_text(text.replace('"seed": 0', '"seed": 1', 1))
+    assert cli.main(command) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{mine}/blocked.json: was changed after it was measured" in line
+
+
+def test_digest_covers_the_content(tmp_path: Path):
+    """Claim: the digest is SHA-256 of the rest as JSON with sorted keys and no spaces, whatever the
+    order and the indentation of the file; content without one passes."""
+    sealed = seal.seal({"b": (1, 0.1), "a": {"é": None}})
+    rest = b'{"a":{"\\u00e9":null},"b":[1,0.1]}'
+    assert sealed["sha256"] == hashlib.sha256(rest).hexdigest()
+    assert seal.is_intact(dict(reversed(json.loads(json.dumps(sealed, indent=7)).items())))
+    assert not seal.is_intact({**sealed, "b": [1, 0.2]})
+    assert not seal.is_intact({**sealed, "c": 0})
+    assert seal.is_intact({"b": 1})
 
 
 def test_missing_things_are_noted(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
