@@ -160,6 +160,7 @@ def sweep(
     network: Any = None,
     learner: Learner | None = None,
     episodes: int = 0,
+    together: int = 0,
     resume: bool = False,
     verbose: bool = True,
     stop: signals.Stop | None = None,
@@ -169,16 +170,18 @@ def sweep(
     Args: seeds, cfg.seed and those after it. vary, values by dotted setting, "algo" or "task", as
     in {"learn.tau": (0.01, 0.02)}. run_dir, a folder that does not exist. devices, how many to use;
     shard, what they divide: the seeds, or the scenes of each seed. sampler, network, learner: parts
-    of your own, see `train`. episodes, that every final policy is evaluated in. resume, continues
-    the sweep in run_dir, which has the same settings. Returns: the summary, grasp success of every
-    combination over its seeds with 95 % intervals. Raises as `train`.
+    of your own, see `train`. episodes, that every final policy is evaluated in. together, runs in
+    one program at most, to need less memory; 0 for all that can be. resume, continues the sweep in
+    run_dir, which has the same settings. Returns: the summary, grasp success of every combination
+    over its seeds with 95 % intervals. Raises as `train`.
     """
     own = OwnParts(sampler, network, learner)
     own_parts.check(own, init)
     own_parts.check_varied(own, vary or {})
-    plan = SweepPlan(seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes)
+    plan = SweepPlan(seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes, together)
     runner.check_plan(plan)
-    room = devices or 1, seeds * len(plan.points)
+    runs = seeds * len(plan.points)
+    room = devices or 1, min(runs, together or runs)
     points = [point._replace(cfg=backend.resolve(point.cfg, *room)) for point in plan.points]
     plan, stop = plan._replace(points=points), stop or signals.Stop()
     folder = new_folder(f"sweep-{cfg.preset}") if run_dir is None else Path(run_dir)
@@ -205,7 +208,7 @@ def run_sweep(
     cache.enable()
     mesh = sharding.make(devices)
     for cfg in (point.cfg for point in plan.points):
-        sharding.check(mesh, shard, plan.seeds, cfg.train.scenes, cfg.learn.batch)
+        sharding.check(mesh, shard, plan.together or plan.seeds, cfg.train.scenes, cfg.learn.batch)
         initial_networks(cfg, init)
     runner.check_room(plan, 1 if mesh is None or shard == "scenes" else mesh.size)
 

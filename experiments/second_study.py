@@ -5,6 +5,7 @@ run DIR            trains and evaluates what is left, for at most --minutes
 evaluate DIR       evaluates the trained policies that are left, a process for each core
 status DIR         the state of each arm
 pack DIR           an archive of each part that has begun, into experiments/results/study
+unpack DIR         the arms of the archives, so that `run` goes on elsewhere
 report             the tables, from the archives
 
 An arm is a sweep in DIR/PART/ARM. `run` goes on where it stopped; its exit code is 3 if arms are
@@ -62,7 +63,7 @@ ABOUT = {
     "guarded": "a guarded descent, with and without pushes",
 }
 NONE = "--policy.primitive grasp --explore.push-fraction 0"  # no pushes
-LARGE = "pushes --algo csac --train.actions 327680"
+LARGE = "pushes --algo csac --train.actions 327680 --together 1"  # five take more than 141 GB
 CLEAR = "--scene.certified blocked --task.kind clear --task.max-actions 15"
 SMALL = (
     "--train.scenes 64 --train.actions 20480 --train.learning-starts 256 "
@@ -120,7 +121,7 @@ def arms() -> list[Arm]:
     """Returns the arms of the protocol in the order in which they run."""
     return [
         *(
-            Arm("pushes", f"{on}-{name}", f"{LARGE} {task} {no}", (MAIN, 5), 5.9, of)
+            Arm("pushes", f"{on}-{name}", f"{LARGE} {task} {no}", (MAIN, 5), 9.6, of)
             for on, task, of in (("enclosed", "", OF_TARGETS), ("blocked", CLEAR, OF_CLEARING))
             for name, no in (("pushes", ""), ("none", NONE))
         ),
@@ -147,7 +148,7 @@ def arms() -> list[Arm]:
 def _small(part: str, name: str, more: str = "", volume: int = 16, first: int = MAIN) -> Arm:
     algo = "" if "--algo" in more else "--algo csac"
     words = f"pushes {algo} {SMALL.format(volume)} {more}"
-    return Arm(part, name, words, (first, 8), 4.8 if volume == 16 else 3.8, ("enclosed",))
+    return Arm(part, name, words, (first, 8), 3.5 if volume == 16 else 2.4, ("enclosed",))
 
 
 def _replay(name: str, volume: int) -> Arm:
@@ -315,7 +316,7 @@ def states(chosen: Sequence[Arm], folder: Path) -> Iterator[dict[str, str]]:
 
 
 def pack(chosen: Sequence[Arm], folder: Path, archives: Path) -> Iterator[Path]:
-    """Writes an archive of each part that has trained arms: logs, configs and evaluations."""
+    """Writes an archive of each part that has trained arms: plans, logs and evaluations."""
     for part in dict.fromkeys(arm.part for arm in chosen):
         trained = [arm for arm in chosen if arm.part == part and is_trained(arm, folder)]
         paths = [path for arm in trained for path in sorted(_records(folder / arm.place))]
@@ -325,7 +326,19 @@ def pack(chosen: Sequence[Arm], folder: Path, archives: Path) -> Iterator[Path]:
             yield archive
 
 
+def unpack(archives: Path, folder: Path) -> None:
+    """Writes the arms of the archives below a folder, without their checkpoints."""
+    for archive in sorted(archives.glob(f"second-*{results.ARCHIVE}")):
+        part = archive.name.removeprefix("second-").removesuffix(results.ARCHIVE)
+        for name, content in index.contents(archive).items():
+            path = folder / part / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+
+
 def _records(place: Path) -> Iterator[Path]:
+    yield from (place / files.SWEEP_PLAN, place / runner.SUMMARY)
+    yield from place.glob(f"{runner.GROUPS}/*/done")
     for run in runner.runs_of(runner.read_plan(place)):
         names = (files.CONFIG, files.METRICS, "eval*.json")
         yield from itertools.chain.from_iterable((place / run).glob(name) for name in names)
@@ -345,7 +358,8 @@ def _write_archive(archive: Path, about: str, folder: Path, paths: Sequence[Path
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="second_study", description=__doc__.splitlines()[0])
-    parser.add_argument("command", choices=("plan", "run", "evaluate", "status", "pack", "report"))
+    commands = ("plan", "run", "evaluate", "status", "pack", "unpack", "report")
+    parser.add_argument("command", choices=commands)
     parser.add_argument("folder", nargs="?", type=Path, default=Path("runs/second"))
     parser.add_argument("--minutes", type=float, default=9.0, help="of this call of run")
     parser.add_argument("--archives", type=Path, default=study.ARCHIVES)
@@ -374,6 +388,8 @@ def call(options: argparse.Namespace) -> int:
         evaluate(chosen, options.folder, options.jobs)
     elif options.command == "report":
         print(second_tables.report(options.archives, [arm.place for arm in chosen]))
+    elif options.command == "unpack":
+        unpack(options.archives, options.folder)
     elif options.command == "pack":
         print(*pack(chosen, options.folder, options.archives), sep="\n")
     else:

@@ -37,6 +37,8 @@ class SweepOptions:
     separate a tuple's items: replay.end=1:4,1:12."""
     evaluate: int = 0
     """Episodes to evaluate every final policy in, for the tables of the sweep's study.md."""
+    together: int = 0
+    """Runs in one program, at most: fewer need less memory. 0: all that can be."""
     run_dir: Path | None = None
     """Folder of the sweep, which must not exist; runs/sweep-PRESET-TIME if not given."""
     resume: Path | None = None
@@ -149,10 +151,11 @@ def _new_plan(preset: str | None, flags: list[str], options: SweepOptions) -> An
     from csac_jax.sweeps import runner
 
     devices, runs = _devices(options), options.seeds * len(points)  # at most so many side by side
+    runs = min(runs, options.together or runs)
     points = [one._replace(cfg=backend.resolve(one.cfg, devices, runs)) for one in points]
     for point in points:
         failures.check_physics(point.cfg, devices)
-    plan = runner.SweepPlan(options.seeds, points, options.evaluate)
+    plan = runner.SweepPlan(options.seeds, points, options.evaluate, options.together)
     runner.check_plan(plan)
     runner.groups_of(plan._replace(seeds=1))
     return plan

@@ -55,6 +55,7 @@ class SweepPlan(NamedTuple):
     seeds: int
     points: list[grid.SweepPoint]
     episodes: int = 0  # that every final policy is evaluated in
+    together: int = 0  # runs in one program, at most; 0: all that can be
 
 
 class SweepResult(NamedTuple):
@@ -118,13 +119,15 @@ def read_plan(folder: Path) -> SweepPlan:
 def _parse_plan(stored: dict[str, Any]) -> SweepPlan:
     if stored.pop(DIGEST, None) not in (None, _digest(stored)):  # old ones have none
         raise ValueError("it was changed after it had been written")
-    if stored.keys() - {"episodes"} != {"seeds", "settings"}:
+    if stored.keys() - {"episodes", "together"} != {"seeds", "settings"}:
         raise ValueError("it is no plan of a sweep")
     points = []
     for point in stored["settings"]:
         values = dict(renames.current_setting(*pair) for pair in point["values"].items())
         points.append(grid.SweepPoint(point["name"], values, configs.from_dict(point["config"])))
-    return SweepPlan(stored["seeds"], points, stored.get("episodes", 0))
+    return SweepPlan(
+        stored["seeds"], points, stored.get("episodes", 0), stored.get("together", 0)
+    )
 
 
 def plan_text(plan: SweepPlan) -> str:
@@ -133,7 +136,8 @@ def plan_text(plan: SweepPlan) -> str:
         {"name": point.name, "values": point.values, "config": configs.to_dict(point.cfg)}
         for point in plan.points
     ]
-    content = {"seeds": plan.seeds, "settings": points, "episodes": plan.episodes}
+    numbers = {"episodes": plan.episodes, "together": plan.together}
+    content = {"seeds": plan.seeds, "settings": points, **numbers}
     return json.dumps({**content, DIGEST: _digest(content)}, indent=2) + "\n"
 
 
@@ -147,6 +151,8 @@ def check_plan(plan: SweepPlan) -> None:
         raise SettingsError(f"seeds: 1 to {grid.MOST_RUNS} runs in all, seeds times settings")
     fits = type(plan.episodes) is int and 0 <= plan.episodes <= MOST_EPISODES
     require(fits, f"episodes: 0 to {MOST_EPISODES}")
+    fits = type(plan.together) is int and plan.together >= 0
+    require(fits, "together: at least 1, or 0 for all side by side")
     for name in (names := [point.name for point in plan.points]):
         if not isinstance(name, str) or not _NAME.fullmatch(name) or not name.isprintable():
             raise SettingsError(f"{shown(name)} is no name of a folder")
@@ -177,14 +183,20 @@ def groups_of(plan: SweepPlan) -> list[tuple[ProgramGroup, list[Path]]]:
     runs = {cfg: run for run, cfg in runs_of(plan).items()}
     if len(runs) < plan.seeds * len(plan.points):
         raise SettingsError("vary: two settings have the same values; leave one of them out")
-    return [(group, [runs[cfg] for cfg in group.configs]) for group in group_configs(list(runs))]
+    most = plan.together or len(runs)
+    groups = [
+        group._replace(configs=group.configs[first : first + most])
+        for group in group_configs(list(runs))
+        for first in range(0, len(group.configs), most)
+    ]
+    return [(group, [runs[cfg] for cfg in group.configs]) for group in groups]
 
 
 def check_room(plan: SweepPlan, devices: int) -> None:
     """Raises SettingsError if a group's runs, divided among `devices`, exceed their memory."""
-    for group, _ in groups_of(plan._replace(seeds=1)):
-        cfg, runs = group.configs[0], -(-len(group.configs) * plan.seeds // devices)
-        memory.check(cfg, runs)
+    for group, _ in groups_of(plan._replace(seeds=1, together=0)):
+        runs = len(group.configs) * plan.seeds
+        memory.check(group.configs[0], -(-min(runs, plan.together or runs) // devices))
 
 
 @dataclasses.dataclass

@@ -44,7 +44,7 @@ def check(cfg: Config, runs: int = 1) -> None:
         remedy = "lower heightmap.size"
     if runs > 1:
         taken = f"{taken}, enough for {available // (needed // runs)} of {runs} runs side by side"
-        remedy = f"{remedy}, lower seeds or raise devices"
+        remedy = f"{remedy}, lower seeds, set together or raise devices"
     raise SettingsError(f"replay.capacity: {taken}; {remedy}")
 
 

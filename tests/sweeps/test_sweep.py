@@ -291,3 +291,16 @@ def test_runs_must_fit_together(monkeypatch: pytest.MonkeyPatch):
     runner.check_room(plan, 2)
     with pytest.raises(SettingsError, match=r"replay\.capacity: .* enough for 4 of 6 runs"):
         runner.check_room(plan, 1)
+    runner.check_room(plan._replace(together=4), 1)
+
+
+def test_together_bounds_a_program(uninterrupted, tmp_path: Path):
+    """Claim: no program has more runs than `together`; each run is the same, bit for bit, as side
+    by side; the plan in the folder keeps the number, which is not negative."""
+    plan, programs = PLAN._replace(together=1), Programs()
+    runner.run(plan, tmp_path / "a", programs, Listener(), Stop())
+    assert [len(group.configs) for group in programs.groups] == [1] * SEEDS * len(PLAN.points)
+    assert _final(tmp_path / "a") == _final(uninterrupted[0])
+    assert runner.read_plan(tmp_path / "a") == plan
+    with pytest.raises(SettingsError, match="together"):
+        runner.check_plan(plan._replace(together=-1))
