@@ -93,8 +93,8 @@ class SimConfig(Section, section="sim"):
     """Physics and the two motion primitives; both primitives take `substeps` physics steps."""
 
     timestep: ClassVar[float] = 0.004  # s, of a physics step
-    iterations: ClassVar[int] = 10  # Newton iterations; with 5, pads that slip throw blocks (ours)
-    line_search: ClassVar[int] = 10  # line-search steps of one Newton iteration (ours)
+    iterations: ClassVar[int] = 12  # Newton iterations; with 5, pads that slip throw blocks (ours)
+    line_search: ClassVar[int] = 12  # line-search steps of one Newton iteration (ours)
     approach_height: ClassVar[float] = 0.10  # m above the place, where a primitive starts and ends
     grasp_depth: ClassVar[float] = 0.035  # m, of the finger tips below the surface (VPG: 0.03-0.04)
     push_length: ClassVar[float] = 0.10  # m (VPG)

@@ -1,5 +1,7 @@
 """True contact: the hand presses no harder than it may, holds by friction, and stops where told."""
 
+import copy
+import dataclasses
 import functools
 from typing import Any
 
@@ -53,8 +55,10 @@ def _grid(side: int) -> SceneState:
 
 @functools.cache
 def _executed(cfg: Config) -> Any:
-    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    return _executor(cfg, simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim))
 
+
+def _executor(cfg: Config, physics: simulation.Physics) -> Any:
     def run(scene: SceneState, primitive: Any, pose: Any) -> Any:
         height = observe.observe(cfg, scene, None).height
         action = Action(primitive=primitive, pose=pose)
@@ -133,15 +137,16 @@ def test_all_of_a_finger_collides(gripper: str):
     assert (compiled.geom_contype[is_hand] == 2).all()
 
 
-@pytest.mark.parametrize(("friction", "holds"), [(0.8, True), (0.1, False)])
+@pytest.mark.parametrize(("friction", "holds"), [(0.8, True), (0.1, True), (0.03, False)])
 def test_grip_holds_by_friction(friction: float, holds: bool):
-    """Claim: 20 N hold a block of 150 g for 2 s within 1 mm at friction 0.8; at 0.1 it falls."""
+    """Claim: two pads of 20 N hold a block of 150 g for 2 s within 1 mm where Coulomb's law says
+    so, above a friction of 0.037; else it falls."""
     half = np.float32([0.02, 0.04, 0.025])
     scene = _scene([(0.0, 0.0)], half, density=0.15 / (8 * half.prod()))
     scene = scene.replace(
         grip=Grip(np.float32(friction), np.float32(20.0)), friction=np.float32([0.1])
     )
-    cfg = _config(1, pad_friction=(0.1, 1.2), grip_force=(15.0, 40.0), grasp_phases=(60, 50, 80))
+    cfg = _config(1, pad_friction=(0.03, 1.2), grip_force=(15.0, 40.0), grasp_phases=(60, 50, 80))
     world = model.build(cfg.scene, cfg.sim)
     fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
     height = np.full((cfg.heightmap.size,) * 2, 2 * half[2])
@@ -157,6 +162,27 @@ def test_grip_holds_by_friction(friction: float, holds: bool):
         assert abs(hangs[-1] - hangs[lifted]) < 1e-3
     else:
         assert qpos[-1, world.block_qpos[0, 2]] < 0.03
+
+
+def test_slippery_pads_lift_a_cube_as_a_converged_solver_says():
+    """Claim: pads of friction 0.5 lift a cube that they meet up to 4 mm and 0.1 rad off its middle,
+    and leave it where 100 iterations of the solver do."""
+    cfg = _config(1, pad_friction=(0.5, 0.5))
+    rng = np.random.default_rng(0)
+    scene = _scene([(0.0, 0.0)]).replace(grip=Grip(np.float32(0.5), np.float32(0.0)))
+    poses = rng.uniform(-1.0, 1.0, (8, 3)) * (0.004, 0.004, 0.1)
+    after, _, lifted = _run(cfg, scene, poses)
+    assert lifted.all()
+    world = model.build(cfg.scene, cfg.sim)
+    converged = copy.copy(world.model)
+    converged.opt.iterations = converged.opt.ls_iterations = 100
+    engine = simulation.make(dataclasses.replace(world, model=converged), cfg.sim)
+    expected, _, _ = jax.device_get(
+        _executor(cfg, engine)(
+            jax.tree.map(jnp.asarray, scene), jnp.int32(Primitive.GRASP), jnp.float32(poses)
+        )
+    )
+    np.testing.assert_allclose(after.position, expected.position, atol=1e-5)
 
 
 def test_an_episode_draws_its_grip():
