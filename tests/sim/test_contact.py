@@ -112,11 +112,11 @@ def _tips(world: model.World, qpos: np.ndarray) -> float:
 
 @pytest.mark.slow
 def test_touching_cubes_cannot_be_grasped():
-    """Claim: of exhaustive grasps of 3 x 3 touching cubes at most 4 % lift; of a hand that presses
+    """Claim: of exhaustive grasps of 3 x 3 touching cubes at most 3 % lift; of a hand that presses
     with 100 N, more do. Two cubes alone are lifted alike."""
     poses = _exhaustive(0.072, 0.012, 8)
     lifts = _run(_config(9), _grid(3), poses)[-1].any(axis=1)
-    assert lifts.mean() <= 0.04
+    assert lifts.mean() <= 0.03
     strong = _run(_config(9, down_force=100.0), _grid(3), poses[::3])[-1].any(axis=1)
     assert strong.mean() > 1.5 * lifts.mean()
     alone = _scene([(-0.08, 0.0), (0.08, 0.02)])
