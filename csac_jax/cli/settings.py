@@ -150,6 +150,7 @@ def parse_view(
     """Parses the `options` of a command, and the changes of the sections VIEW.
 
     Returns the latter as `Config.change` takes them: a setting without a flag stays the policy's.
+    The former are `options` alone: a class made here could not be sent to another process.
     """
     kinds = {}
     for name, some in VIEW.items():
@@ -157,7 +158,8 @@ def parse_view(
         kinds[name] = _some(kind, some or names(kind), "(default: the policy's)")
     given = parsing.parse(_with_sections(options, kinds), flags, command)
     named = {flag.split("=")[0].replace("-", "_") for flag in flags}
-    return given, {
+    own = {field.name: getattr(given, field.name) for field in dataclasses.fields(options)}
+    return options(**own), {
         name: {k: v for k, v in vars(getattr(given, name)).items() if f"__{name}.{k}" in named}
         for name in VIEW
     }

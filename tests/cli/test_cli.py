@@ -5,6 +5,7 @@ import hashlib
 import json
 import logging
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -404,9 +405,11 @@ def test_eval_changes_how_a_policy_decides(
 
 
 def test_settings_of_a_view_are_those_given():
-    """Claim: a setting that is given counts, also where it is the package's default; no other."""
+    """Claim: a setting that is given counts, also where it is the package's default; no other. The
+    options can be sent to another process."""
     flags = ["shipped", "--sensor.dropped=0.0", "--camera.look_at", "0", "0", "0"]
-    _, changes = settings.parse_view(evaluate.EvalOptions, "eval", flags)
+    options, changes = settings.parse_view(evaluate.EvalOptions, "eval", flags)
+    assert pickle.loads(pickle.dumps(options)) == evaluate.EvalOptions(source="shipped")
     wanted = {"sensor": {"dropped": 0.0}, "camera": {"look_at": (0.0, 0.0, 0.0)}}
     assert changes == {"heightmap": {}, "sim": {}, **wanted}
 
