@@ -119,6 +119,16 @@ def test_large_rings_follow_the_beta_law(a, b):
     assert stats.kstest(equal / LARGE, "uniform").pvalue > P
 
 
+def test_one_transition_of_a_large_ring():
+    """Claim: the only filled slot of a ring that is not sorted is drawn; one of SORTED slots has an
+    exact order."""
+    slots = beta_slots(jax.random.key(0), jnp.ones(LARGE), jnp.int32(1), 1.0, 1.0, NUM)
+    assert not np.any(slots)
+    values, size = jnp.ones(samplers.SORTED), jnp.int32(1)
+    order, _ = jax.eval_shape(samplers._ranked, jax.random.key(0), values, size)
+    assert order.shape == values.shape
+
+
 def test_drawing_has_no_open_loop():
     """Claim: no sampler has a loop of unknown length, for which a GPU waits for the host."""
     for sampler in SAMPLERS.values():
@@ -279,6 +289,14 @@ def test_without_an_opposite_only_the_new_counts():
     slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
     assert_array_equal(slots, [2, 1, 2, 1])
     assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
+
+
+def test_only_opposite_is_drawn():
+    """Claim: where a single transition has the opposite outcome, that one is drawn."""
+    state = tried([1, 1, 0, 0, 0], [0.0, 1.0, 0.0, 1.0, 1.0], np.ones(5), 4)
+    found = samplers.opposite_slots(jax.random.key(0), state, jnp.arange(4), 1.0, 2.0)
+    assert_array_equal(found[0], [1, 0, 3, 2])
+    assert np.all(found[1])
 
 
 def test_nan_is_ranked_first():
