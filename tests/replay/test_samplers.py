@@ -292,11 +292,13 @@ def test_without_an_opposite_only_the_new_counts():
 
 
 def test_only_opposite_is_drawn():
-    """Claim: where a single transition has the opposite outcome, that one is drawn."""
+    """Claim: where a single transition has the opposite outcome, that one is drawn, also by a law
+    whose draws round to 1."""
     state = tried([1, 1, 0, 0, 0], [0.0, 1.0, 0.0, 1.0, 1.0], np.ones(5), 4)
-    found = samplers.opposite_slots(jax.random.key(0), state, jnp.arange(4), 1.0, 2.0)
-    assert_array_equal(found[0], [1, 0, 3, 2])
-    assert np.all(found[1])
+    for b in (2.0, 0.01):
+        found = samplers.opposite_slots(jax.random.key(0), state, jnp.arange(4), 1.0, b)
+        assert_array_equal(found[0], [1, 0, 3, 2])
+        assert np.all(found[1])
 
 
 def test_nan_is_ranked_first():
