@@ -283,12 +283,14 @@ def test_half_of_vpgs_batch_is_new(scenes, num, ages):
 
 
 def test_without_an_opposite_only_the_new_counts():
-    """Claim: without an opposite outcome, the draw against it has no weight."""
+    """Claim: without an opposite outcome, the draw against it has no weight; of a ring of three, or
+    of one, only what is stored is drawn."""
     sampler = samplers.make(OppositeReplay())
-    state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), 3, head=3)
-    slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
-    assert_array_equal(slots, [2, 1, 2, 1])
-    assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
+    for size, new in ((3, [2, 1]), (1, [0, 0])):
+        state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), size, head=size)
+        slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
+        assert_array_equal(slots, [*new, *new])
+        assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
 
 
 def test_only_opposite_is_drawn():
