@@ -119,12 +119,14 @@ def test_large_rings_follow_the_beta_law(a, b):
     assert stats.kstest(equal / LARGE, "uniform").pvalue > P
 
 
-def test_one_transition_of_a_large_ring():
-    """Claim: the only filled slot of a ring that is not sorted is drawn; one of SORTED slots has an
-    exact order."""
-    slots = beta_slots(jax.random.key(0), jnp.ones(LARGE), jnp.int32(1), 1.0, 1.0, NUM)
-    assert not np.any(slots)
-    values, size = jnp.ones(samplers.SORTED), jnp.int32(1)
+def test_one_transition_is_drawn():
+    """Claim: the only filled slot of a ring is drawn, also by a law whose draws round to 1; a ring
+    of SORTED slots has an exact order."""
+    size = jnp.int32(1)
+    for capacity in (8, LARGE):
+        slots = beta_slots(jax.random.key(0), jnp.ones(capacity), size, 1.0, 0.01, NUM)
+        assert not np.any(slots)
+    values = jnp.ones(samplers.SORTED)
     order, _ = jax.eval_shape(samplers._ranked, jax.random.key(0), values, size)
     assert order.shape == values.shape
 
