@@ -11,20 +11,25 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps
 # Options of the pinned XLA.
 COMPILE_LITTLE := --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 --xla_llvm_disable_expensive_passes=true --xla_disable_hlo_passes=while-loop-invariant-code-motion
 
-.PHONY: help setup train eval test test-slow test-faults lives lint format bench pictures figures docs browser dist doctor clean
+.PHONY: help setup lock train eval test test-slow test-faults lives lint format bench pictures figures docs browser dist doctor clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-setup: $(STAMP)  ## make .venv and install everything, pinned
+setup: $(STAMP)  ## make .venv and install everything, pinned by hashes
 
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml requirements.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench,dev]'
+	$(INSTALL) --require-hashes -r requirements.txt
+	$(INSTALL) --no-build-isolation -e .
 	touch $@
+
+lock:  ## pin what pyproject.toml asks for, with hashes, in requirements.txt; needs uv
+	uv pip compile pyproject.toml --extra bench --extra dev --extra dist --python-version 3.11.5 --universal --generate-hashes --no-annotate --custom-compile-command "make lock" --quiet --output-file requirements.txt
 
 train: $(STAMP)  ## train PRESET (quick) into a new folder under runs/
 	$(BIN)/csac-jax train $(PRESET) $(ARGS)
@@ -84,9 +89,8 @@ browser: $(STAMP)  ## bundle the script of the page "In the browser" into build/
 	node docs/browser/build.mjs build/browser
 
 dist: $(STAMP)  ## build wheel and sdist into dist/, and check them
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dist]'
 	rm -rf dist
-	$(BIN)/python -m build
+	$(BIN)/python -m build --no-isolation
 	$(BIN)/twine check --strict dist/*
 
 doctor: $(STAMP)  ## versions, devices, numerics self-test

@@ -150,6 +150,7 @@ def parse_view(
     """Parses the `options` of a command, and the changes of the sections VIEW.
 
     Returns the latter as `Config.change` takes them: a setting without a flag stays the policy's.
+    The former are `options` alone: a class made here could not be sent to another process.
     """
     kinds = {}
     for name, some in VIEW.items():

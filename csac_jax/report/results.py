@@ -46,7 +46,7 @@ _NUMBER: Any = int | float | None
 _SHARE = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int}
 _CONFIG = {"preset": str, "algo": str, "seed": int, "sim": {"physics": str, "robot": str}}
 _RECORD = {"device": _TEXT, "versions": dict | None, "commit": _TEXT, "wall_seconds": _NUMBER}
-_RECORD["modules"] = dict | None
+_RECORD |= {"modules": dict | None, "config": _CONFIG}
 _COUNTS = dict.fromkeys(("episodes", "pushes", "grasps"), int)
 _METRICS = {**dict.fromkeys((*METRICS, "declutter_rate"), _SHARE), "counts": _COUNTS}
 _EVALUATION = {"policy": str, "suite": str, "seed": int, "config": _CONFIG, "parts": {}}
@@ -181,6 +181,13 @@ def _read_json(path: Path) -> Json:
         return {}
 
 
+def _run_config(folder: Path) -> Json:
+    """Reads the config of the run in a folder; empty where there is none."""
+    config = _read_json(folder / files.CONFIG)
+    _check(config, _CONFIG, files.CONFIG)
+    return config
+
+
 def _check(content: Any, shape: Json, name: str) -> None:
     """Raises SettingsError where an object has a key of `shape` with a value of another type."""
     if not isinstance(content, dict):
@@ -198,9 +205,7 @@ def _is_small(value: Any) -> bool:
 
 def _add_run(file: Path, path: Path, results: Results) -> None:
     """Adds the run of a log, or a note where it has no config or no grasp yet."""
-    config = _read_json(file.parent / files.CONFIG)
-    _check(config, _CONFIG, files.CONFIG)
-    config = renames.current(config)
+    config = renames.current(_run_config(file.parent))
     with warnings.catch_warnings(record=True) as damage:
         warnings.simplefilter("always")
         lines = files.read_log(file)
@@ -306,7 +311,7 @@ def _variant(file: Path, path: Path, config: Json) -> Variant:
     folder = Path(os.path.realpath(path)).parent
     source = folder.parent.name if folder.name.startswith("seed-") else folder.name
     if path.name != files.METRICS:
-        _, robot = variants.world(_read_json(file.parent / files.CONFIG))
+        _, robot = variants.world(_run_config(file.parent))
         config = {**config, "sim": {**config.get("sim", {}), "robot": robot}}
         source = f"{source}, {path.stem}"
     return dataclasses.replace(variants.variant(config), source=source)

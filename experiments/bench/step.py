@@ -16,6 +16,7 @@ the map, or transitions in the ring; contact caps grow with the blocks. On an ac
 import argparse
 import contextlib
 import functools
+import itertools
 import resource
 import tempfile
 import time
@@ -98,11 +99,14 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     assert isinstance(learner, CSAC)
     parts = learner.parts
     scenes, nets, num = state.scenes, state.learner, cfg.train.scenes
-    keys, key = step.numbered_keys(jax.random.key(1), num), jax.random.key(2)
+    key, numbers = jax.random.key(1), itertools.count()  # each call has a key of its own number
     choose = jax.vmap(policy.act, (0, None, 0, 0, None))
 
-    def act(keys: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
-        return choose(keys, parts, maps, steps_without_change, jnp.int32(0))
+    def scene_keys(number: jax.Array) -> jax.Array:
+        return step.numbered_keys(jax.random.fold_in(key, number), num)
+
+    def act(number: jax.Array, maps: Any, steps_without_change: jax.Array) -> Action:
+        return choose(scene_keys(number), parts, maps, steps_without_change, jnp.int32(0))
 
     def reward(nets: Any, before: Any, action: Action, after: Any) -> jax.Array:
         result = transitions.to_action_result(
@@ -117,8 +121,12 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         transition = Transition(packed[0], action, jnp.zeros(num), packed[1], ended, label)
         return ring.add(replay, transition, ~after.info.physics_diverged)
 
-    def replace(keys: jax.Array, after: Any) -> Any:
-        return transitions.where(after.done, jax.vmap(env.auto_reset)(keys, after), after)
+    def learn(number: jax.Array, nets: Any, replay: Any) -> Any:
+        return step.learn(program, jax.random.fold_in(key, number), nets, replay, nets.updates)
+
+    def replace(number: jax.Array, after: Any) -> Any:
+        fresh = jax.vmap(env.auto_reset)(scene_keys(number), after)
+        return transitions.where(after.done, fresh, after)
 
     jit = functools.partial(jax.jit, compiler_options=compiler.options(cfg))
     run = {
@@ -127,13 +135,11 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "simulate": jax.jit(jax.vmap(env.step)),
         "reward": jit(reward),
         "remember": jax.jit(remember, donate_argnums=0),
-        "learn": jit(
-            lambda key, nets, replay: step.learn(program, key, nets, replay, nets.updates)
-        ),
+        "learn": jit(learn),
         "replace": jax.jit(replace),
     }
     maps = run["dense_maps"](nets.online, scenes.obs)
-    action = run["act"](keys, maps, scenes.steps_without_change)
+    action = run["act"](next(numbers), maps, scenes.steps_without_change)
     after = run["simulate"](scenes, action)
     replay = run["remember"](jax.tree.map(jnp.copy, state.replay), scenes, action, after)
     filled = jax.tree.map(jnp.copy, replay)
@@ -146,12 +152,12 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
     bare = _bare.joint_trajectories(cfg, scenes.obs.height, action)
     return {
         "dense_maps": lambda: run["dense_maps"](nets.online, scenes.obs),
-        "act": lambda: run["act"](keys, maps, scenes.steps_without_change),
+        "act": lambda: run["act"](next(numbers), maps, scenes.steps_without_change),
         "simulate": lambda: run["simulate"](scenes, action),
         "reward": lambda: run["reward"](nets, scenes, action, after),
         "remember": remember_again,
-        "learn": lambda: run["learn"](key, nets, filled),
-        "replace": lambda: run["replace"](keys, after),
+        "learn": lambda: run["learn"](next(numbers), nets, filled),
+        "replace": lambda: run["replace"](next(numbers), after),
         "bare_loop": _bare.loop(env.physics, scenes.scene, bare),
     }
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from csac_jax import algorithms
 from csac_jax.agent import rewards
@@ -51,6 +51,12 @@ def test_push_rewards(after, expected):
         assert reward(CFG, Primitive.PUSH, before=0.5, after=after, changed=changed) == expected
 
 
+def test_a_rise_by_the_dead_band_is_no_gain():
+    """Claim: eq. 16's inequality is strict: phi has to rise by more than the dead band."""
+    after = jnp.array([CFG.dead_band, np.nextafter(np.float32(CFG.dead_band), np.float32(1.0))])
+    assert_array_equal(rewards.gains_value(CFG, jnp.zeros(2), after), [False, True])
+
+
 @pytest.mark.parametrize("outcome", Outcome)
 def test_push_ignores_the_outcome_of_a_grasp(outcome):
     """Claim: a push earns no reach reward and no grasp level, whatever is in `outcome`."""
@@ -67,6 +73,32 @@ def test_distance_is_a_loss():
         near = with_constants(cfg, distance_cap=cap)
         dropped = reward(near, Primitive.GRASP, Outcome.DROPPED, 7.0)  # of level 0
         assert_allclose(dropped, loss, rtol=1e-6)
+
+
+@pytest.mark.parametrize("was", [False, True])
+@pytest.mark.parametrize("good", [False, True])
+def test_new_label_earns_its_reward(was, good):
+    """Claim: the reward of a push that is relabelled is the one that the new label would earn."""
+    cfg = with_constants(RewardConfig(push_levels=(-2.0, 3.0)), eta=(0.25, 3.0), push_level=-1.0)
+    old, new = (reward(cfg, Primitive.PUSH, after=float(label)) for label in (was, good))
+    got = rewards.relabel(cfg, jnp.array([old]), jnp.array([was]), jnp.array([good]))
+    assert_allclose(got, [new], rtol=1e-6)
+
+
+def test_rewards_of_a_step_are_those_of_its_actions():
+    """Claim: each action of a step is rewarded by itself; only pushes that gain are good ones."""
+    results = rewards.ActionResult(
+        primitive=jnp.array([Primitive.PUSH, Primitive.PUSH, Primitive.GRASP, Primitive.GRASP]),
+        outcome=jnp.array([0, 0, Outcome.LIFTED, Outcome.NOTHING]),
+        distance=jnp.zeros(4),
+        phi_before=jnp.zeros(4),
+        phi_after=jnp.array([1.0, 0.0, 1.0, 0.0]),
+        changed=jnp.zeros(4, bool),
+        blocks_lost=jnp.zeros(4, jnp.int32),
+    )
+    each, good = rewards.rewards_of(CFG, results)
+    assert_array_equal(each, [0.5, -0.5, 2.0, -1.0])
+    assert_array_equal(good, [True, False, False, False])
 
 
 @pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])

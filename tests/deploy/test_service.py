@@ -5,6 +5,8 @@ import concurrent.futures
 import contextlib
 import http.client
 import json
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -213,6 +215,20 @@ def test_bad_requests_are_refused(server: Server, body: Any, status: int, detail
     assert detail in answer["detail"]
     assert len(answer["detail"]) < 400
     assert server.ask("GET", "/health") == (200, {"status": "ok"})
+
+
+@pytest.mark.slow
+def test_answers_are_those_of_the_schema(server: Server, tmp_path: Path):
+    """Claim: of the requests that schemathesis makes of the schema, good and bad ones, all get an
+    answer that the schema has. That bytes are a whole PNG no schema can say."""
+    pytest.importorskip("schemathesis")
+    run = "from schemathesis.cli import schemathesis; schemathesis()"
+    options = ["-H", f"Authorization: Bearer {TOKEN}", "--checks", "all", "--seed", "0"]
+    options += ["--exclude-checks", "positive_data_acceptance"]
+    where = f"http://127.0.0.1:{server.port}/openapi.json"
+    command = [sys.executable, "-c", run, "run", where, *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("token", [TOKEN, "wrong"])

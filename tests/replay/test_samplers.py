@@ -119,6 +119,18 @@ def test_large_rings_follow_the_beta_law(a, b):
     assert stats.kstest(equal / LARGE, "uniform").pvalue > P
 
 
+def test_one_transition_is_drawn():
+    """Claim: the only filled slot of a ring is drawn, also by a law whose draws round to 1; a ring
+    of SORTED slots has an exact order."""
+    size = jnp.int32(1)
+    for capacity in (8, LARGE):
+        slots = beta_slots(jax.random.key(0), jnp.ones(capacity), size, 1.0, 0.01, NUM)
+        assert not np.any(slots)
+    values = jnp.ones(samplers.SORTED)
+    order, _ = jax.eval_shape(samplers._ranked, jax.random.key(0), values, size)
+    assert order.shape == values.shape
+
+
 def test_drawing_has_no_open_loop():
     """Claim: no sampler has a loop of unknown length, for which a GPU waits for the host."""
     for sampler in SAMPLERS.values():
@@ -273,12 +285,24 @@ def test_half_of_vpgs_batch_is_new(scenes, num, ages):
 
 
 def test_without_an_opposite_only_the_new_counts():
-    """Claim: without an opposite outcome, the draw against it has no weight."""
+    """Claim: without an opposite outcome, the draw against it has no weight; of a ring of three, or
+    of one, only what is stored is drawn."""
     sampler = samplers.make(OppositeReplay())
-    state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), 3, head=3)
-    slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
-    assert_array_equal(slots, [2, 1, 2, 1])
-    assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
+    for size, new in ((3, [2, 1]), (1, [0, 0])):
+        state = tried([1, 0, 1, 1, 1], [0.0, 0.5, 0.0, 1.0, 1.0], np.ones(5), size, head=size)
+        slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 4)
+        assert_array_equal(slots, [*new, *new])
+        assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
+
+
+def test_only_opposite_is_drawn():
+    """Claim: where a single transition has the opposite outcome, that one is drawn, also by a law
+    whose draws round to 1."""
+    state = tried([1, 1, 0, 0, 0], [0.0, 1.0, 0.0, 1.0, 1.0], np.ones(5), 4)
+    for b in (2.0, 0.01):
+        found = samplers.opposite_slots(jax.random.key(0), state, jnp.arange(4), 1.0, b)
+        assert_array_equal(found[0], [1, 0, 3, 2])
+        assert np.all(found[1])
 
 
 def test_nan_is_ranked_first():

@@ -609,7 +609,9 @@ def test_damaged_lines_are_counted(recorded: Path, capsys: pytest.CaptureFixture
         ("eval.json", "[" * 100_000),
         ("eval.json", '{"policy": "learned", "config": {}, "parts": {"a": {"completion": 3}}}'),
         ("train.json", '{"versions": 3}'),
+        ("train.json", '{"config": []}'),
         ("config.json", '{"preset": ["paper"]}'),
+        ("config.json", '{"sim": 0.5}'),
     ],
 )
 def test_damaged_record_is_left_out_with_a_note(
@@ -618,6 +620,7 @@ def test_damaged_record_is_left_out_with_a_note(
     """Claim: a record with damage of any kind is left out with a note, and the others are shown."""
     bad = tmp_path / "bad"
     _run(bad, _config("csac_beta", 9), [0.5])
+    _evaluation(bad / "eval.json", _config("csac_beta", 9), 5)
     (bad / name).write_text(content)
     assert cli.main(["report", str(recorded), str(bad)]) == 0
     printed, complaint = capsys.readouterr()
