@@ -178,7 +178,9 @@ def sweep(
     own = OwnParts(sampler, network, learner)
     own_parts.check(own, init)
     own_parts.check_varied(own, vary or {})
-    plan = SweepPlan(seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes, together)
+    plan = SweepPlan(
+        seeds, _points(own_parts.named(cfg, own), dict(vary or {})), episodes, together
+    )
     runner.check_plan(plan)
     runs = seeds * len(plan.points)
     room = devices or 1, min(runs, together or runs)

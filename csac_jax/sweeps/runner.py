@@ -125,9 +125,7 @@ def _parse_plan(stored: dict[str, Any]) -> SweepPlan:
     for point in stored["settings"]:
         values = dict(renames.current_setting(*pair) for pair in point["values"].items())
         points.append(grid.SweepPoint(point["name"], values, configs.from_dict(point["config"])))
-    return SweepPlan(
-        stored["seeds"], points, stored.get("episodes", 0), stored.get("together", 0)
-    )
+    return SweepPlan(stored["seeds"], points, stored.get("episodes", 0), stored.get("together", 0))
 
 
 def plan_text(plan: SweepPlan) -> str:

@@ -57,7 +57,10 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
         ("smoke --vary learn.tau=0.1,0.10", "vary: two settings have the same values"),
         ("smoke --devices 4096", "devices: 4096 asked for, there are "),
         ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores"),
-        ("smoke --replay.capacity 65536 --seeds 9999", "lower seeds, set together or raise devices"),
+        (
+            "smoke --replay.capacity 65536 --seeds 9999",
+            "lower seeds, set together or raise devices",
+        ),
         ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
         (
             f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary policy.retry={TAUS}",
