@@ -121,7 +121,7 @@ def _read(bench: str, pattern: str = "") -> list[dict[str, Any]]:
 def completions() -> dict[tuple[str, str], dict[str, Any]]:
     """Returns the completion of each suite and policy, pooled over records, seeds and parts, with
     its 95 % interval."""
-    records = [*_read("benchmark"), *_read("push_suites")]
+    records = [*_read("benchmark", "half"), *_read("push_suites")]
     counts: dict[tuple[str, str], tuple[int, int]] = {}
     for row in [row for record in records for row in record["results"]]:
         for part in row.get("parts", {"": row}).values():
