@@ -40,8 +40,8 @@ SAMPLERS = {
 OURS = {
     "blocked": "pushes",
     "enclosed": "pushes",
-    "tray": "shipped_clutter",
-    "hidden": "shipped_target",
+    "tray": "pushes",
+    "hidden": "pushes",
     "target": "shipped_target",
     "cases": "shipped_clutter",
     "packed": "shipped_clutter",

