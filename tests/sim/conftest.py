@@ -135,7 +135,7 @@ CASES: dict[str, tuple[SceneState, Action]] = {
     "empty": (place(cube=(-0.0205, 0.0275, 0.0)), grasp(0.0125, -0.0055, np.pi / 4)),
     "touched": (place(cube=(0.05, 0.0, 0.0)), grasp(0.0, 0.0)),  # a finger comes down on the cube
     # Across the slopes, off the middle: it slips out.
-    "dropped": (place(prism=(0.01, 0.02, 1.2)), grasp(0.0, 0.0)),
+    "dropped": (place(prism=(0.0, 0.026, 1.2)), grasp(0.0, 0.0)),
     "lifted": (place(cube=(0.0, 0.0, 0.0), other=(0.15, 0.1, 0.5)), grasp(0.0, 0.0)),
     "push": (place(cube=(0.06, 0.0, 0.0), prism=(-0.1, 0.1, 0.0)), push(0.0, 0.0)),
     "miss": (place(cube=(0.06, 0.06, 0.0)), push(0.0, 0.0)),
