@@ -182,10 +182,8 @@ def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
     return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
 
 
-def execute_settled(
-    config: Config, count: int, scripted: Sequence[tuple[SceneState, Action]]
-) -> Run:
-    """Runs the scripted cases and grasps in `count` settled scenes in MJX, as one batch."""
+def execute_settled(config: Config, count: int) -> Run:
+    """Runs grasps in `count` settled scenes in MJX, as one batch."""
     config = config.change(sim={"physics": "mjx"})
     per_number = count // (1 + len(config.scene.slots) - config.scene.min_blocks)
     settled = pool.settled(config, pool.TRAIN_STREAM, per_number)
@@ -193,11 +191,7 @@ def execute_settled(
     def plan(scene: SceneState) -> Action:
         return oracle.grasp(config, scene, observe.observe(config, scene).height)
 
-    batches = [(settled, _noisy(jax.jit(jax.vmap(plan))(settled)))]
-    if scripted:
-        batches.insert(0, stack(scripted))
-    scenes, actions = jax.tree.map(lambda *leaves: np.concatenate(leaves), *batches)
-    return execute(config, scenes, actions)
+    return execute(config, settled, _noisy(jax.jit(jax.vmap(plan))(settled)))
 
 
 @pytest.fixture(scope="session")
@@ -210,28 +204,22 @@ def c_world() -> model.World:
     return model.build(CONFIG.scene, dataclasses.replace(CONFIG.sim, physics="c"))
 
 
-@pytest.fixture(scope="session")
-def executed(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """CASES and SETTLED grasps in MJX: one compilation for the tests of this folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return execute_settled(CONFIG, SETTLED, list(CASES.values()))
-
-
 @pytest.fixture(scope="session", params=["c", "mjx", WARP])
 def cases(request: pytest.FixtureRequest) -> Run:
     """CASES on each engine."""
-    if request.param == "mjx":
-        return request.getfixturevalue("executed").at(slice(len(CASES)))
-    jitter = (CONFIG.scene.size_jitter[0], 0.0)  # Warp's meshes have one size
+    jitter = CONFIG.scene.size_jitter
+    if request.param == "warp":  # whose meshes have one size
+        jitter = (jitter[0], 0.0)
     cfg = CONFIG.change(scene={"size_jitter": jitter}, sim={"physics": request.param})
     return execute(cfg, *stack(list(CASES.values())))
 
 
 @pytest.fixture(scope="session")
-def grasped(executed: Run) -> Run:
-    """The grasps in settled scenes."""
-    return executed.at(slice(len(CASES), None))
+def grasped(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Grasps in settled scenes in MJX: one compilation for the tests of this folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
+        return execute_settled(CONFIG, SETTLED)
 
 
 @pytest.fixture(scope="session")
@@ -254,4 +242,4 @@ def doubled_caps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
     caps = {"geom_pairs": 2 * config.sim.geom_pairs, "contacts": 2 * config.sim.contacts}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        return tuple(execute_settled(cfg, SETTLED, []) for cfg in (config, config.change(sim=caps)))
+        return tuple(execute_settled(cfg, SETTLED) for cfg in (config, config.change(sim=caps)))
