@@ -128,13 +128,6 @@ def _bars(draw: _Draw) -> list[Laid]:
     return [Laid((0.0, y), (draw.long(), width, high)) for y, width in row]
 
 
-def _grid(draw: _Draw) -> list[Laid]:
-    """Lays two rows of two blocks, two of which are wider than the opening."""
-    columns, rows, high = draw.many(2, 0.060, 0.068), draw.many(2, 0.060, 0.068), draw(0.035, 0.05)
-    xs, ys = _middles(columns), _middles(rows)
-    return [Laid((xs[i], ys[j]), (columns[i], rows[j], high)) for i in range(2) for j in range(2)]
-
-
 def _slabs(draw: _Draw) -> list[Laid]:
     """Lays two slabs together, each longer than the opening and half as wide."""
     widths, high = draw.many(2, 0.058, 0.070), draw(0.030, 0.050)
@@ -315,7 +308,6 @@ def _constructions(**places: tuple[str, Place]) -> dict[str, Construction]:
 
 TRAIN = _constructions(
     bars=("blocked", _bars),
-    grid=("blocked", _grid),
     slabs=("blocked", _slabs),
     arcade=("blocked", _arcade),
     frame=("enclosed", _frame),
