@@ -1,6 +1,7 @@
 """A peer's exam, with a simulator of a few lines in the peer's place: a box on a table, which is
 lifted if the hand would close on it."""
 
+import json
 import sys
 import types
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax.cli import main
+from experiments import index
 from experiments.peers import clutter_removal, exam
 from experiments.peers.clutter_removal import Peer, View
 from experiments.peers.exam import Options, Round
@@ -74,7 +76,8 @@ class Simulator:
     rng: Any
 
     def __init__(self) -> None:
-        self.camera, self.num_objects, self.grasps = Camera(self), 0, []
+        self.camera, self.num_objects = Camera(self), 0
+        self.grasps: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
 
     def reset(self, count: int) -> None:
         self.num_objects = count
@@ -98,6 +101,7 @@ class Simulator:
 
 
 PEER = Peer(Simulator, Grasp, Pose, "")
+NOTES = {"clearance": ", tips 4 mm low", **dict.fromkeys(("oblique", "obliquefit"), ", oblique")}
 HAND = {"gripper": "franka_hand", "opening": "full"}
 
 
@@ -151,6 +155,26 @@ def test_shares_are_those_of_the_protocol():
     assert found["declutter_rate"]["low"] < 8 / 12 < found["declutter_rate"]["high"]
     ends = {"unseen": 1, "refused": 0}
     assert found["counts"] == {"rounds": 3, "presented": 12, "tried": 12, "lifted": 8, **ends}
+
+
+def test_page_has_the_recorded_shares():
+    """Claim: the page's table of the exam is the record, lifted / taken of scenes and openings."""
+    shares: dict[str, dict[str, str]] = {}
+    for name, record in json.loads((index.RESULTS / "bench" / "peers.json").read_text()).items():
+        scene, kind = name.split("-")
+        for row in record["rows"]:
+            values = [100 * row[one]["value"] for one in ("grasp_success", "declutter_rate")]
+            cells = shares.setdefault(f"`{row['policy']}`{NOTES.get(kind, '')}", {})
+            cells[f"{scene} {row['opening']}"] = "{:.1f}/{:.1f}".format(*values)
+    columns = ("pile full", "pile fit", "packed full", "packed fit")
+    rows = {head: [cells.get(one, "") for one in columns] for head, cells in shares.items()}
+    page = (index.ROOT / "docs" / "benchmarks" / "policies.md").read_text()
+    table = page.split("| packed, fitted |\n")[1].split("\n\n")[0].splitlines()[1:]
+    assert {head: cells for head, *cells in map(_cells, table)} == rows
+
+
+def _cells(row: str) -> list[str]:
+    return [cell.strip() for cell in row.strip("|").split("|")]
 
 
 def test_what_is_missing_is_one_line(

@@ -25,6 +25,7 @@ from experiments.bench._options import Parser, emit
 from experiments.peers import clutter_removal, exam
 
 OBJECTS = 5  # of a round
+MOST_NOISE = 0.05  # m
 
 
 def main(arguments: list[str]) -> None:
@@ -44,6 +45,8 @@ def main(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.rounds < 1:
         parser.error("--rounds: must be at least 1")
+    if not 0.0 <= options.noise <= MOST_NOISE:
+        parser.error(f"--noise: must lie in 0 .. {MOST_NOISE} m")
     check_seed(options.seed)
     begun = time.perf_counter()
     try:
