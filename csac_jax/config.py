@@ -105,8 +105,8 @@ class SimConfig(Section, section="sim"):
     `warp` on one CUDA device where it is known to be faster, else `mjx`, or `c` for objects."""
     robot: RobotKind = "hand"  # The gripper alone, floating; or on that arm (for own arms).
     gripper: str | Gripper = "rg2"
-    """`rg2`, `2f85`, `franka_hand`, or a folder with your own gripper.json and gripper.xml.
-    `varied` has another opening and other fingers in every episode."""
+    """`rg2`, `2f85`, `franka_hand`, `wsg32`, or a folder with your own gripper.json and
+    gripper.xml. `varied` has another opening and other fingers in every episode."""
     base: tuple[float, float, float, float] = number((0.6, 0.0, 0.35, 0.0), -math.pi, math.pi)
     """Pose of the arm's base: x, y, z, m, and yaw, rad (ours: scenes/README.md; for own arms)."""
     adapter: float = number(0.0, 0.0, 0.3)  # Arm's flange to gripper, m (for own arms).

@@ -27,7 +27,7 @@ def _write(folder: Path, numbers: Any) -> str:
 
 def test_shipped_grippers_name_their_sources():
     """Claim: each shipped gripper says where its lengths are from."""
-    assert {"2f85", "franka_hand", "rg2", "varied"} <= {*grippers.shipped()}
+    assert {"2f85", "franka_hand", "rg2", "varied", "wsg32"} <= {*grippers.shipped()}
     for name in grippers.shipped():
         sources = _numbers(name)["sources"]
         assert {*sources} >= {*grippers.LENGTHS} - {"clearance"}

@@ -91,7 +91,7 @@ def test_nothing_and_too_wide_change_nothing(gripper: str):
         np.testing.assert_allclose(kept, [0.0, grippers.load(gripper).half.open], rtol=1e-6)
 
 
-@pytest.mark.parametrize("gripper", grippers.shipped())
+@pytest.mark.parametrize("gripper", ["2f85", "rg2", "varied"])
 def test_one_rule_for_one_and_many(gripper: str):
     """Claim: jit and vmap decide as one grasp alone; openings lie within the hand's, also for
     fingers that vary, at the map's border, and on maps of noise."""
