@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import tyro
 
-from csac_jax.cli import parsing, settings
+from csac_jax.cli import settings
 from csac_jax.cli.failures import check_extra
 from csac_jax.cli.robot_options import PolicyOptions, check_size
 from csac_jax.config import Config
@@ -18,7 +18,11 @@ NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportOptions(PolicyOptions):
-    """Writes a policy, networks and config, into one file."""
+    """Writes a policy, networks and config, into one file.
+
+    Settings of view and hand, such as --sim.gripper and --sensor.dropped, go into its config: a
+    policy that learned with many hands and noises is measured with those of the file.
+    """
 
     file: tyro.conf.Positional[Path]
     """File to write, which must not exist, such as policy.safetensors."""
@@ -48,7 +52,7 @@ class ExportOptions(PolicyOptions):
 
 def run(arguments: list[str]) -> int:
     """Writes the file; returns the exit code."""
-    options = parsing.parse(ExportOptions, arguments, "export")
+    options, view = settings.parse_view(ExportOptions, "export", arguments)
     _check(options)
     from csac_jax import deploy
     from csac_jax.io import configs, files, policy_file
@@ -56,7 +60,7 @@ def run(arguments: list[str]) -> int:
 
     evaluated = model_card.read(options.card) if options.card else []
     policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
-    cfg = policy.cfg.change(policy=settings.decision(options))
+    cfg = policy.cfg.change(**view, policy=settings.decision(options))
     params = policy.params if options.average is None else _mean(policy.params, options.average)
     if options.format == "safetensors":
         policy_file.save(options.file, params, cfg)

@@ -29,9 +29,9 @@ FIRST = {
     "net": ("kind",),
 }
 """The settings that people change first: those of the short help."""
-_HAND = ("gripper", "base", "adapter", "clearance", "opening")
+_HAND = ("gripper", "base", "adapter", "clearance", "opening", "pad_friction", "grip_force")
 VIEW: dict[str, tuple[str, ...]] = {"heightmap": (), "camera": (), "sensor": (), "sim": _HAND}
-"""Sections of a policy's view and hand, () or some of their settings, for `eval` and `play`."""
+"""Sections of a policy's view and hand, () or some of their settings; `train` has all."""
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:

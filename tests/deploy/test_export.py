@@ -190,16 +190,19 @@ def test_exports_open_as_the_policy():
 
 
 def test_policy_files(policy: CameraPolicy, tmp_path: Path):
-    """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for, else
-    as it is; `--average` writes the mean of each number of two policies, and the config of one."""
+    """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for, and
+    with a view and hand that are given, else as it is; `--average` writes the mean of each number
+    of two policies, and the config of one."""
     copy, mean = tmp_path / "copy.safetensors", tmp_path / "mean.safetensors"
     asked = ["--augment=on", "--height-bonus=3", "--retry_temperature=0.1"]
-    changed = {"augment": True, "height_bonus": 3.0, "retry_temperature": 0.1}
-    for options, changes in (([], {}), (asked, changed)):
+    asked += ["--sim.pad-friction", "0.8", "0.8", "--sensor.grey=0.5"]
+    changed: dict[str, Any] = {"augment": True, "height_bonus": 3.0, "retry_temperature": 0.1}
+    world = {"sim": {"pad_friction": (0.8, 0.8)}, "sensor": {"grey": 0.5}}
+    for options, changes in (([], {}), (asked, {"policy": changed, **world})):
         copy.unlink(missing_ok=True)
         assert cli.main(["export", "shipped", str(copy), *options]) == 0
         cfg, params = policy_file.load(copy)
-        assert cfg == policy.cfg.change(policy=changes)
+        assert cfg == policy.cfg.change(**changes)
         jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
     policy_file.save(copy, jax.tree.map(lambda leaf: 3.0 * leaf, params), cfg.change(seed=7))
     assert cli.main(["export", "shipped", str(mean), "--average", str(copy)]) == 0

@@ -272,7 +272,7 @@ def test_objects_go_as_in_c():
 
 @needs_warp
 def test_held_objects_hang_as_in_c(tmp_path: Path):
-    """Claim: a bar hangs where it hangs in C for a second, within 0.1 mm."""
+    """Claim: a bar hangs where it hangs in C for a second, within 0.5 mm."""
     sim = {"physics": "warp", "grasp_phases": (60, 50, 250)}
     cfg = presets.get("quick").change(scene=bar(tmp_path), sim=sim)
     scene, joints = grasped_bar(cfg)
@@ -280,7 +280,7 @@ def test_held_objects_hang_as_in_c(tmp_path: Path):
         jax.jit(_physics(kind, cfg).run)(scene, joints) for kind in ("warp", "c")
     )
     assert trace.held.all()
-    np.testing.assert_allclose(after.position, after_c.position, atol=1e-4)
+    np.testing.assert_allclose(after.position, after_c.position, atol=5e-4)
 
 
 @needs_warp
@@ -291,7 +291,7 @@ def test_many_objects_fit_on_warp():
     world = model.build(cfg.scene, cfg.sim)
     from csac_jax.sim import warp_action
 
-    placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world))
+    placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world, cfg.sim))
     assert placed.nv == 66
     assert placed.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert placed.opt.iterations == warp_action.CONE_EFFORT
