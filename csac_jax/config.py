@@ -211,8 +211,9 @@ class HeightmapConfig(Section, section="heightmap"):
 
     size: int = number(64, 16, 1024)  # H = W, cells.
     extent: float = number(0.448, 0.1, 1.0)  # Side of the workspace, m (VPG; for own tables).
-    view: Literal["ortho", "oblique"] = "ortho"
-    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras)."""
+    view: Literal["ortho", "oblique", "both"] = "ortho"
+    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras).
+    `both`: an episode has either, half and half."""
 
     @property
     def cell(self) -> float:
@@ -495,7 +496,7 @@ class Config(Section):
         for name, off in (("pose_noise", 0), ("intrinsics_noise", 0), ("kind", "none")):
             is_off = getattr(self.sensor, name) == getattr(SensorConfig, name)
             fault = f"sensor.{name}: must be {off} where heightmap.view is ortho"
-            require(is_off or self.heightmap.view == "oblique", fault)
+            require(is_off or self.heightmap.view != "ortho", fault)
         size, rotations = self.heightmap.size, self.net.rotations
         most = 2 * math.floor(0.5 * math.pi * size)
         fits = rotations % 2 == 0 and rotations <= most

@@ -81,7 +81,7 @@ def _walls(cfg: Config) -> np.ndarray:
     places = (np.arange(size, dtype=np.float32) - 0.5 * (size - 1)) * cell
     xy = np.stack(np.meshgrid(places, places), axis=-1)
     # A point that a camera at the side sees lies anywhere in its cell.
-    margin = 0.5 * cfg.heightmap.cell if cfg.heightmap.view == "oblique" else 0.0
+    margin = 0.5 * cfg.heightmap.cell if cfg.heightmap.view != "ortho" else 0.0
     return tray.heights(cfg.scene.tray, xy, margin)
 
 

@@ -132,11 +132,12 @@ def _name(options: EvalOptions) -> str:
     return options.name or learned.get(options.policy, options.policy)
 
 
-def _policy(options: EvalOptions, changes: dict[str, Any]) -> tuple[Any, Any]:
-    from csac_jax.evaluation import policies
+def _policy(options: EvalOptions, changes: dict[str, Any], suite: str) -> tuple[Any, Any]:
+    """Returns the policy, and the changed config of its world in a suite."""
+    from csac_jax.evaluation import policies, suites
 
     policy = policies.make(options.policy, options.source, _which(options.which))
-    return policy, policy.cfg.change(**changes)
+    return policy, suites.standard(policy.cfg, suite).change(**changes)
 
 
 def _measure(
@@ -157,7 +158,7 @@ def _measure(
 
     cache.enable()
     begun = time.time()
-    policy, cfg = _policy(options, changes)
+    policy, cfg = _policy(options, changes, suite)
     has_objects = suite in suites.SUITES and suites.SUITES[suite].objects
     objects = options.objects if has_objects or options.out is None else None
     world = (options.seed, options.physics, options.robot, objects, options.split)
@@ -184,7 +185,7 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
 
     require(out.is_dir() or not out.exists(), f"--out: {out} is a file; give a folder")
     out.mkdir(parents=True, exist_ok=True)  # before hours of work
-    policy, cfg = _policy(options, changes)
+    policy, cfg = _policy(options, changes, options.suites[0])
     chosen = _fitting(options, cfg) if "all" in options.suites else options.suites
     for suite in chosen:
         suites.check(suite)

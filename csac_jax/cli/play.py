@@ -120,7 +120,8 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
 
     cache.enable()
     world = (options.seed, options.physics, options.robot, options.objects)
-    cfg, suite = policy.cfg.change(**view), _suite(options.scene)
+    suite = _suite(options.scene)
+    cfg = suites.standard(policy.cfg, suite).change(**view)
     prepared = suites.prepare(cfg, suite, 1, *world, split="all")
     env, *others = prepared.parts.values()
     require(not others, f"--scene: {options.scene} has several parts; give a suite of one part")

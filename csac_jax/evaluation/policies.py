@@ -228,10 +228,9 @@ def is_learned(policy: Policy) -> bool:
 
 
 def warn_if_elsewhere(policy: Policy, cfg: Config) -> None:
-    """Warns of networks in a world that they were not trained in; `both` knows either task."""
+    """Warns of networks in a world that they were not trained in."""
     if is_learned(policy):
-        kind = cfg.task.kind if policy.cfg.task.kind == "both" else policy.cfg.task.kind
-        made_for.warn_if_elsewhere(policy.cfg.change(task={"kind": kind}), cfg)
+        made_for.warn_if_elsewhere(policy.cfg, cfg)
 
 
 def in_world(policy: Policy, cfg: Config) -> Policy:

@@ -48,9 +48,8 @@ def evaluate(
     """
     if not isinstance(suite, suites.PreparedSuite):
         learned = policies.is_learned(policy)
-        suite = suites.prepare(
-            policy.cfg, suite, episodes, seed, physics, robot, objects, split, learned
-        )
+        cfg = suites.standard(policy.cfg, suite)
+        suite = suites.prepare(cfg, suite, episodes, seed, physics, robot, objects, split, learned)
     tables = {}
     for name, env in suite.parts.items():
         policies.warn_if_elsewhere(policy, env.cfg)

@@ -150,6 +150,27 @@ def prepare(
     return PreparedSuite(suite, cfg, parts, episodes, seed)
 
 
+def standard(cfg: Config, suite: str) -> Config:
+    """Returns a policy's config with one world where it trained in many, for the suites of all.
+
+    A hand that varies becomes the RG2, a drawn grip the gripper's own, and of views from above and
+    aside the exact one from above is taken. `in_distribution` keeps what training had.
+    """
+    if suite == IN_DISTRIBUTION:
+        return cfg
+    world: dict[str, Any] = {}
+    if grippers.load(cfg.sim.gripper).varies is not None:
+        world["gripper"] = SimConfig.gripper
+    for name in ("pad_friction", "grip_force"):
+        low, high = getattr(cfg.sim, name)
+        if low < high:
+            world[name] = getattr(SimConfig, name)
+    cfg = cfg.change(sim=world)
+    if cfg.heightmap.view != "both":
+        return cfg
+    return cfg.change(heightmap={"view": "ortho"}, sensor=SensorConfig())
+
+
 def check(suite: str) -> None:
     """Raises SettingsError for a name that is neither a suite's, nor a file's, nor a folder's."""
     if RENAMED_SUITES.get(suite, suite) in SUITES:

@@ -33,19 +33,31 @@ def view(cfg: Config) -> str:
     if cfg.heightmap.view == "ortho":
         return ABOVE
     noise = "exact" if cfg.sensor.kind == "none" else "noisy"
-    return f"{noise} images of an oblique camera"
+    aside = f"{noise} images of an oblique camera"
+    return aside if cfg.heightmap.view == "oblique" else f"{ABOVE}, and {aside}"
 
 
 def warn_if_elsewhere(made: Config, used: Config) -> None:
     """Warns, in one line, of a hand, view, task or objects that a policy was not trained with."""
     same_hand = made.net.gripper or _fingers(made) == _fingers(used)
+    mixed = len({kind == "object" for kind in made.scene.slots}) == 2
+    known = {  # to a policy that trained with either
+        "hand": same_hand,
+        "view": made.heightmap.view == "both",
+        "task": made.task.kind == "both",
+        "objects": mixed,
+    }
     pairs = {
-        "hand": ("", "") if same_hand else (str(made.sim.gripper), str(used.sim.gripper)),
+        "hand": (str(made.sim.gripper), str(used.sim.gripper)),
         "view": (view(made), view(used)),
         "task": (task(made), task(used)),
         "objects": (objects(made), objects(used)),
     }
-    others = [f"{name} {was}, not {now}" for name, (was, now) in pairs.items() if was != now]
+    others = [
+        f"{name} {was}, not {now}"
+        for name, (was, now) in pairs.items()
+        if was != now and not known[name]
+    ]
     if others:
         text = f"this policy was trained with {'; '.join(others)}: expect less of it"
         warnings.warn(f"{text}; csac-jax policies lists those that ship", DataWarning, stacklevel=3)

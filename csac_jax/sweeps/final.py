@@ -60,6 +60,7 @@ def _measure_point(
     In C MuJoCo if they were trained in it, on whatever device. Args: left, files to write.
     """
     physics: PhysicsKind = "c" if cfg.sim.physics == "c" else "auto"
+    cfg = suites.standard(cfg, suite)
     prepared = suites.prepare(cfg, suite, episodes, SEED, physics, cfg.sim.robot)
     for path, trained in left.items():
         if stop.signal is not None:

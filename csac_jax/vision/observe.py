@@ -2,7 +2,8 @@
 
 `HeightmapConfig.view` `ortho` is complete: one ray straight down per cell. `oblique` is the depth
 image of a camera at the side, its points projected along gravity as in VPG (arXiv:1803.09956);
-hidden cells are empty. S = surfaces, see `raycast.SurfaceHit`, G = geoms, [h, w] = camera pixels.
+hidden cells are empty. `both` takes either for an episode. S = surfaces, see `raycast.SurfaceHit`,
+G = geoms, [h, w] = camera pixels.
 """
 
 import math
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import Config, HeightmapConfig, SceneConfig, SensorConfig, SlotKind
+from csac_jax.config import Config, HeightmapConfig, SceneConfig, SlotKind
 from csac_jax.vision import camera, depth_camera, heightmap, raycast, sensor
 from csac_jax.vision.camera import Camera
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
@@ -44,8 +45,14 @@ class Shapes(NamedTuple):
         return 1 + self.blocks.offset.size
 
 
-def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
-    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`."""
+def observe(
+    cfg: Config, scene: SceneState, key: jax.Array | None = None, at_side: jax.Array | None = None
+) -> Observation:
+    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`.
+
+    Where `cfg.heightmap.view` is `both`, `at_side` [] bool says whether the camera stands at the
+    side; None: it looks from above.
+    """
     shapes = scene_shapes(cfg.scene, scene)
     light: Any = camera.LIGHT
     if key is not None and cfg.sensor.light > 0.0:
@@ -53,8 +60,13 @@ def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Obs
     tables = scene_tables(cfg.scene, scene, shapes, light)
     if cfg.heightmap.view == "oblique":
         return oblique(cfg, shapes, tables, key)
-    exact = ortho(cfg.heightmap, shapes, tables)
-    return exact if key is None else ortho_noisy(key, cfg.sensor, exact, tables)
+    if cfg.heightmap.view == "ortho" or at_side is None:
+        return above(cfg, shapes, tables, key)
+    keys = [None, None] if key is None else jax.random.split(key)
+    views = [
+        look(cfg, shapes, tables, key) for look, key in zip((oblique, above), keys, strict=True)
+    ]
+    return jax.tree.map(lambda *views: jnp.where(at_side, *views), *views)
 
 
 def seen_share(cfg: SceneConfig, scene: SceneState) -> jax.Array:
@@ -193,10 +205,12 @@ def cast_pixels(cfg: Config, eye: Camera, shapes: Shapes) -> SurfaceHit:
     return raycast.cast_windows(objects, hits, corner, side, ray, shapes.first)
 
 
-def ortho_noisy(
-    key: jax.Array, noise: SensorConfig, exact: Observation, tables: SurfaceTables
-) -> Observation:
-    """Adds the noise of a sensor at VIEW_HEIGHT; cells without a depth are empty."""
+def above(cfg: Config, shapes: Shapes, tables: SurfaceTables, key: jax.Array | None) -> Observation:
+    """Observes from above; with a key with the noise of a sensor at VIEW_HEIGHT, and cells without
+    a depth are empty."""
+    exact, noise = ortho(cfg.heightmap, shapes, tables), cfg.sensor
+    if key is None:
+        return exact
     key_depth, key_colour = jax.random.split(key)
     depth, valid = sensor.depth(key_depth, noise, VIEW_HEIGHT - exact.height)
     colour = jnp.where(valid[..., None], exact.colour, 0.0)

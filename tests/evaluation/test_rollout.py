@@ -309,10 +309,20 @@ def test_policies_say_what_they_were_not_made_for(
     assert all(text in line and "\n" not in line for line in lines)
 
 
-@pytest.mark.parametrize("kind", ["clear", "target"])
-def test_policies_of_both_tasks_know_either(kind: str):
-    """Claim: nothing warns of the task of a policy that was trained in both."""
-    cfg = presets.quick().change(sim={"physics": "auto"}, task={"kind": "both"})
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"task": {"kind": "clear"}},
+        {"task": {"kind": "target"}},
+        {"heightmap": {"view": "ortho"}},
+        {"heightmap": {"view": "oblique"}},
+        {"scene": {"slots": ("box",), "min_blocks": 1}},
+        {"scene": {"slots": ("object",), "min_blocks": 1}},
+    ],
+)
+def test_policies_of_both_know_either(change: dict[str, Any]):
+    """Claim: nothing warns of task, view or objects of a policy that was trained in both."""
+    cfg = presets.general().change(sim={"physics": "auto"}, heightmap={"view": "both"})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(task={"kind": kind}))
+        policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(**change))

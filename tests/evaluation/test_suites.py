@@ -56,6 +56,20 @@ def test_cases_are_the_shipped_files():
         assert env.cfg.sim.contacts >= 64
 
 
+def test_worlds_of_training_become_one():
+    """Claim: a policy of many hands, grips and views is measured with the RG2, its own grip and the
+    exact view from above; one of a single world keeps it, and so does `in_distribution`."""
+    grip = {"pad_friction": (0.5, 1.2), "grip_force": (20.0, 70.0)}
+    many = CFG.change(
+        sim={"gripper": "varied", **grip}, heightmap={"view": "both"}, sensor={"grey": 0.3}
+    )
+    assert suites.standard(many, "random10") == CFG
+    assert suites.standard(many, suites.IN_DISTRIBUTION) == many
+    single = {"gripper": "2f85", "pad_friction": (0.8, 0.8)}
+    one = CFG.change(sim=single, heightmap={"view": "oblique"}, sensor={"kind": "d415"})
+    assert suites.standard(one, "random10") == one
+
+
 @pytest.mark.parametrize("suite", ["random10", "packed"])
 def test_suite_is_the_same_for_every_policy(suite: str):
     """Claim: scenes that are dropped or drawn do not depend on what a policy was trained with."""

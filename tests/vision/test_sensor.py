@@ -1,6 +1,7 @@
 """The sensor's errors follow their laws, and cost nothing when there are none."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -173,6 +174,33 @@ def test_colours_are_dropped_for_whole_episodes(view):
     np.testing.assert_array_equal(states.obs.colour[~grey[0]], true.colour[~grey[0]])
     every = _env(heightmap=view, sensor=SensorConfig(grey=1.0)).reset(jax.random.key(0))
     assert (every.obs.colour == sensor.GREY).all()
+
+
+@pytest.mark.mjx
+def test_half_of_the_episodes_are_seen_from_the_side():
+    """Claim: by view `both` an episode has all its views from above or all from the side, half and
+    half, each as that view alone; without a key it is seen from above."""
+    env = _env(heightmap=dataclasses.replace(OBLIQUE, view="both"))
+    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(6), 64))
+    later = jax.jit(jax.vmap(env.step, (0, None)))(states, _PUSH)
+    alone = {
+        name: jax.jit(jax.vmap(functools.partial(observe.observe, _env(heightmap=view).cfg)))
+        for name, view in (("aside", OBLIQUE), ("above", SMALL))
+    }
+    drawn = []
+    for state in (states, later):
+        alike = {
+            name: np.isclose(look(state.scene).height, state.obs.height, atol=1e-6).all((1, 2))
+            for name, look in alone.items()
+        }
+        np.testing.assert_array_equal(alike["above"], ~alike["aside"])
+        drawn.append(alike["aside"])
+    np.testing.assert_array_equal(*drawn)
+    assert 0.3 < drawn[0].mean() < 0.7
+    scene = jax.tree.map(lambda leaf: leaf[0], states.scene)
+    np.testing.assert_allclose(
+        _look(env, scene).height, alone["above"](states.scene).height[0], atol=1e-6
+    )
 
 
 @pytest.mark.mjx
