@@ -13,7 +13,7 @@ import pytest
 
 from csac_jax import env as environment, presets
 from csac_jax.agent import actor_critic
-from csac_jax.config import TaskConfig
+from csac_jax.config import SensorConfig, TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
 from csac_jax.evaluation import policies, rollout, suites
@@ -322,7 +322,7 @@ def test_policies_say_what_they_were_not_made_for(
 )
 def test_policies_of_both_know_either(change: dict[str, Any]):
     """Claim: nothing warns of task, view or objects of a policy that was trained in both."""
-    cfg = presets.general().change(sim={"physics": "auto"}, heightmap={"view": "both"})
+    cfg = presets.general().change(sim={"physics": "auto"}, sensor=SensorConfig())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(**change))
