@@ -28,6 +28,7 @@ _DIGESTS = {  # so that a replaced file is detected
     "clear": "28e4450df466158ece399eace4a792748c65f3d430210f145b6621c4d5344cd2",
     "camera": "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
     "clutter": "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
+    "general": "3b6006bd1d0bf9c324275f3d11015a9ea902087ad1725adedac29f0d5ac470ac",
     "grippers": "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
     "objects": "12bf20a8a5597f313de22580922bfa6b0ac89f614ae06d4afe401f81f1ad425e",
     "target": "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",

@@ -211,6 +211,7 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
     [
         ("shipped", "fast", "clear", "ortho", "rg2"),
         ("shipped_camera", "fast", "clear", "oblique", "rg2"),
+        ("shipped_general", "general", "both", "ortho", "varied"),
         ("shipped_clutter", "fast", "clear", "ortho", "rg2"),
         ("shipped_grippers", "fast", "clear", "ortho", "varied"),
         ("shipped_objects", "objects", "clear", "ortho", "rg2"),
