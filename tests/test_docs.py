@@ -197,7 +197,7 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
     need hardware, which are marked `py`."""
-    for module in ("flatbuffers", "jax2onnx", "onnxruntime"):
+    for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
     assert _run_page(ROBOT.read_text()) >= 6
