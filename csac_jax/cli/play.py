@@ -28,7 +28,8 @@ class PlayOptions:
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
     """Policy: oracle (reads the poses), planner (simulates many actions), geometric, random, one
-    that a module of --import registers, a shipped one, a run or a policy file."""
+    that a module of --import registers, a shipped one, a run or a policy file. The last three
+    with +planner at the end: physics chooses among what the networks propose."""
     physics: Literal["c", "mjx"] = "c"
     """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
@@ -103,7 +104,8 @@ def _policy(options: PlayOptions) -> Any:
     from csac_jax.evaluation import policies, suites
 
     if options.policy not in policies.BASELINES:
-        return policies.load(options.policy)
+        source = options.policy.removesuffix("+planner")
+        return policies.make("learned" if source == options.policy else "learned+planner", source)
     has_target = options.scene in suites.SUITES and suites.SUITES[options.scene].target
     task = {"kind": "target"} if has_target else {}
     return policies.BASELINES[options.policy](presets.quick().change(task=task))
