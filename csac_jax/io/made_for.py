@@ -40,12 +40,12 @@ def warn_if_elsewhere(made: Config, used: Config) -> None:
     """Warns, in one line, of a hand, view, task or objects that a policy was not trained with."""
     same_hand = made.net.gripper or _fingers(made) == _fingers(used)
     pairs = {
-        "hand": ("", "") if same_hand else (str(made.sim.gripper), str(used.sim.gripper)),
-        "view": (view(made), view(used)),
-        "task": (task(made), task(used)),
-        "objects": (objects(made), objects(used)),
+        "hand ": ("", "") if same_hand else (str(made.sim.gripper), str(used.sim.gripper)),
+        "view ": (view(made), view(used)),
+        "task ": (task(made), task(used)),
+        "": (objects(made), objects(used)),
     }
-    others = [f"{name} {was}, not {now}" for name, (was, now) in pairs.items() if was != now]
+    others = [f"{name}{was}, not {now}" for name, (was, now) in pairs.items() if was != now]
     if others:
         text = f"this policy was trained with {'; '.join(others)}: expect less of it"
         warnings.warn(f"{text}; csac-jax policies lists those that ship", DataWarning, stacklevel=3)
