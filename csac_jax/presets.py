@@ -228,11 +228,11 @@ def paper_small() -> Config:
 
 
 def smoke() -> Config:
-    """Runs the whole pipeline in 64 actions, for tests; too small to learn."""
+    """Runs the whole pipeline in 64 actions, on a CPU within a minute; too small to learn."""
     return Config().change(
         preset="smoke",
         scene={"slots": ("box", "box", "prism"), "min_blocks": 2, "pool": 8, "settle_time": 1.0},
-        sim={"grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
+        sim={"physics": "auto", "grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
         cem={"candidates": 16, "elites": 4, "rounds": 2},

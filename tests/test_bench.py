@@ -2,16 +2,18 @@
 
 import contextlib
 import json
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from csac_jax import presets
-from csac_jax.errors import SettingsError
+from csac_jax.errors import FailedError, SettingsError
 from csac_jax.nets import dense
 from experiments import index
-from experiments.bench import __main__ as page, learner, step_kernels
+from experiments.bench import __main__ as page, learner, serve, step_kernels
 
 
 def test_operations_are_those_of_the_net():
@@ -37,6 +39,19 @@ def test_time_in_which_kernels_run():
     assert table["kinds"]["reductions"] == {"ms": 1.0, "launches": 1}
     with pytest.raises(SettingsError, match="no GPU ran a kernel"):
         step_kernels.table([])
+
+
+def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a service that ends before it answers is one line, with its exit code and the last
+    line that it wrote to stderr."""
+    text = "import sys; sys.stderr.write('a warning\\nno such extra\\n'); sys.exit(2)"
+    start = subprocess.Popen
+    monkeypatch.setattr(serve, "body", bytes)
+    monkeypatch.setattr(
+        serve.subprocess, "Popen", lambda _, **pipes: start([sys.executable, "-c", text], **pipes)
+    )
+    with pytest.raises(FailedError, match=r"did not start \(exit code 2\): no such extra$"):
+        serve.measure(1, 9)
 
 
 def test_page_shows_figures_and_failures():

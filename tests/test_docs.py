@@ -197,7 +197,7 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
     need hardware, which are marked `py`."""
-    for module in ("flatbuffers", "jax2onnx", "onnxruntime"):
+    for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
     assert _run_page(ROBOT.read_text()) >= 6
@@ -219,7 +219,7 @@ def test_robot_page_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         _run_command(line)
     (tmp_path / "record/000001/outcome.json").write_text('{"outcome": "lifted"}')
     for line in [line for line in lines if "mine.safetensors" in line]:
-        _run_command(line.replace("finetune shipped", "finetune shipped --updates 10 --batch 2"))
+        _run_command(line.replace(" record --out", " record --updates 10 --batch 2 --out"))
     training = [shlex.split(line)[2:] for line in lines if line.startswith("csac-jax train")]
     assert len(training) == 2
     for arguments in training:

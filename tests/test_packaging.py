@@ -1,5 +1,7 @@
 """The package as its users get it: a wheel, installed without the checkout."""
 
+import ast
+import inspect
 import os
 import subprocess
 import sys
@@ -14,14 +16,17 @@ import pytest
 import csac_jax
 from csac_jax.scenes import cases
 
+from jax._src.export import serialization  # isort: skip
+
 ROOT = Path(csac_jax.__file__).parents[1]
 PINS = (ROOT / "requirements.txt").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 DATA = ("policies/clear.safetensors", "report/page.html", "py.typed", "_scenes/ur5.xml")
 COMMANDS = (
-    "train smoke --sim.physics c --run-dir run",
+    "train smoke --run-dir run",
     "eval run --episodes 2 --json run/eval.json",
     "eval shipped --suite cases --episodes 1",
+    "demo",
     "play --scene pinwheel --policy shipped --png play.png",
     "export run policy.safetensors",
     "report run --out page",
@@ -53,6 +58,16 @@ def test_extras_are_sorted_and_pinned():
     for one in needed:
         name = one.split("[")[0].split(">")[0].split("=")[0].lower().replace("_", "-")
         assert name == "csac-jax" or f"\n{name}==" in PINS, name
+
+
+def test_traced_programs_need_no_extra():
+    """Claim: a plain installation has the library by which JAX writes traced programs: a training
+    on a CPU keeps them on disk."""
+    tree = ast.parse(inspect.getsource(serialization))
+    lines = [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    imported = {name.name for line in lines for name in line.names}
+    foreign = imported - sys.stdlib_module_names - {"jax", "numpy"}
+    assert foreign <= {one.split(">")[0] for one in PROJECT["dependencies"]}
 
 
 @pytest.fixture(scope="module")
@@ -105,4 +120,4 @@ def test_installed_package_works(built: Path, tmp_path: Path):
         done = subprocess.run([python, "-m", "csac_jax", *command.split()], check=False, **here)
         assert done.returncode == 0, f"{command}: {done.stderr}"
     made = {path.name for path in (tmp_path / "work").iterdir()}
-    assert made == {"run", "play.png", "policy.safetensors", "page"}
+    assert made == {"run", "demo.webp", "play.png", "policy.safetensors", "page"}

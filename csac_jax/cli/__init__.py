@@ -18,6 +18,7 @@ from csac_jax.cli import (
     act,
     bench,
     calibrate,
+    demo,
     doctor,
     evaluate,
     export,
@@ -43,6 +44,7 @@ from csac_jax.section import require
 _LESS = "lower --replay.capacity, --train.scenes, --learn.batch or --seeds, or raise --devices"
 
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
+    "demo": demo.run,
     "train": train.run,
     "sweep": sweep.run,
     "eval": evaluate.run,
@@ -63,6 +65,7 @@ USAGE = f"""usage: {PROGRAM} COMMAND ...
 
 A robot learns to push and grasp in clutter.
 
+  demo               write a video of an arm that pushes a block free, in about a minute
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR continue a run that was stopped

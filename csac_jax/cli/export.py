@@ -13,8 +13,6 @@ from csac_jax.config import Config
 from csac_jax.errors import SettingsError
 from csac_jax.section import require
 
-NEEDS = {"stablehlo": "flatbuffers", "onnx": "jax2onnx"}  # modules of the extra `export`
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportOptions(PolicyOptions):
@@ -82,8 +80,8 @@ def _check(options: ExportOptions) -> None:
     fits = options.input == "maps" or options.format == "stablehlo"
     require(fits, "--input image: needs --format stablehlo")
     check_size(options.size)
-    if options.format in NEEDS:
-        check_extra(f"--format {options.format}", NEEDS[options.format], "export")
+    if options.format == "onnx":
+        check_extra("--format onnx", "jax2onnx", "export")
 
 
 def _mean(params: Any, source: str) -> Any:

@@ -1,6 +1,7 @@
 """`csac-jax play`: one episode, shown."""
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -28,7 +29,8 @@ class PlayOptions:
     """`hand`: the gripper floats; or the arm that moves it."""
     policy: str = "oracle"
     """Policy: oracle (reads the poses), planner (simulates many actions), geometric, random, one
-    that a module of --import registers, a shipped one, a run or a policy file."""
+    that a module of --import registers, a shipped one, a run or a policy file. The last three
+    with +planner at the end: physics chooses among what the networks propose."""
     physics: Literal["c", "mjx"] = "c"
     """C MuJoCo or MJX. The motion in a video is always C MuJoCo's."""
     video: Path | None = None
@@ -55,13 +57,20 @@ def run(arguments: list[str]) -> int:
     if drawn:
         opengl = gl.choose()  # before MuJoCo is imported
     begun = time.time()
-    env, steps = _play(options, _policy(options), view)
+    policy = _policy(options)
+    env, steps = _play(options, policy, view)
     from csac_jax.render import episode
 
-    print(episode.summary(env, steps))
-    if drawn or options.viewer:
+    def renderer(env: Any, steps: list[Any]) -> episode.EpisodeRenderer:
         first = steps[0].before
-        stage = episode.EpisodeRenderer(env.cfg, first, options.size, opengl, options.views)
+        return episode.EpisodeRenderer(env.cfg, first, options.size, opengl, options.views)
+
+    def another(seed: int) -> Any:
+        played = _play(dataclasses.replace(options, seed=seed), policy, view)
+        return renderer(*played).film(played[1], seed)
+
+    if drawn or options.viewer:
+        stage = renderer(env, steps)
         episode.record(stage, steps, options.png, options.video)
     taken, lost = episode.totals(steps)
     result = {
@@ -76,7 +85,8 @@ def run(arguments: list[str]) -> int:
     }
     output.write_result(options.json, result, env.cfg)
     if options.viewer:
-        stage.show(steps, lambda text: print(text, flush=True))
+        log = functools.partial(print, flush=True)
+        stage.show(stage.film(steps, options.seed), log, another)
     return 0
 
 
@@ -103,14 +113,16 @@ def _policy(options: PlayOptions) -> Any:
     from csac_jax.evaluation import policies, suites
 
     if options.policy not in policies.BASELINES:
-        return policies.load(options.policy)
+        source = options.policy.removesuffix("+planner")
+        return policies.make("learned" if source == options.policy else "learned+planner", source)
     has_target = options.scene in suites.SUITES and suites.SUITES[options.scene].target
     task = {"kind": "target"} if has_target else {}
     return policies.BASELINES[options.policy](presets.quick().change(task=task))
 
 
 def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any, list[Any]]:
-    """Returns the environment and the records of the episode's steps; prints each at once.
+    """Returns the environment and the records of the episode's steps; prints each at once, and how
+    it ended.
 
     `view` holds changes of the policy's config.
     """
@@ -132,6 +144,7 @@ def _play(options: PlayOptions, policy: Any, view: dict[str, Any]) -> tuple[Any,
     for step in rollout.episode(env, policies.in_world(policy, env.cfg), options.seed):
         steps.append(step)
         print(episode.line(len(steps), step), flush=True)
+    print(episode.summary(env, steps), flush=True)
     return env, steps
 
 

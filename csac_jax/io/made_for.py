@@ -41,22 +41,16 @@ def warn_if_elsewhere(made: Config, used: Config) -> None:
     """Warns, in one line, of a hand, view, task or objects that a policy was not trained with."""
     same_hand = made.net.gripper or _fingers(made) == _fingers(used)
     mixed = len({kind == "object" for kind in made.scene.slots}) == 2
-    known = {  # to a policy that trained with either
-        "hand": same_hand,
-        "view": made.heightmap.view == "both",
-        "task": made.task.kind == "both",
-        "objects": mixed,
-    }
-    pairs = {
-        "hand": (str(made.sim.gripper), str(used.sim.gripper)),
-        "view": (view(made), view(used)),
-        "task": (task(made), task(used)),
-        "objects": (objects(made), objects(used)),
+    pairs = {  # any will do, what was, what is
+        "hand ": (same_hand, str(made.sim.gripper), str(used.sim.gripper)),
+        "view ": (made.heightmap.view == "both", view(made), view(used)),
+        "task ": (made.task.kind == "both", task(made), task(used)),
+        "": (mixed, objects(made), objects(used)),
     }
     others = [
-        f"{name} {was}, not {now}"
-        for name, (was, now) in pairs.items()
-        if was != now and not known[name]
+        f"{name}{was}, not {now}"
+        for name, (knows, was, now) in pairs.items()
+        if not knows and was != now
     ]
     if others:
         text = f"this policy was trained with {'; '.join(others)}: expect less of it"

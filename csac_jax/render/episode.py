@@ -71,10 +71,14 @@ class EpisodeRenderer:
         every = max(round(1.0 / (media.FRAMES_PER_SECOND * self._cfg.sim.timestep)), 1)
         return recorded.qpos[::every]
 
-    def show(self, steps: list[StepRecord], log: Callable[[str], None], again: bool = True) -> None:
-        """Shows the steps in a viewer, see `viewer.play`."""
+    def film(self, steps: list[StepRecord], seed: int) -> viewer.Film:
+        """Simulates the steps of a seed for a viewer."""
         actions = [(line(number, step), self.poses(step)) for number, step in enumerate(steps, 1)]
-        viewer.play(self._model, actions, log, again, self._viewpoint)
+        return viewer.Film(self._model, actions, seed)
+
+    def show(self, film: viewer.Film, log: Callable[[str], None], another: viewer.Another) -> None:
+        """Shows a film in a viewer, see `viewer.play`."""
+        viewer.play(film, log, view=self._viewpoint, another=another)
 
     def _start(self, step: StepRecord) -> np.ndarray:
         scene, pose = step.before.scene, self._data.qpos.copy()

@@ -73,8 +73,10 @@ class Score(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Returns the label of a learned variant, else the policy."""
-        return label(self.variant) if self.policy == "learned" else self.policy
+        """Returns the label of a learned variant, else the policy and its changed settings."""
+        if self.policy == "learned":
+            return label(self.variant)
+        return ", ".join([self.policy, *map(" ".join, self.variant.changed)])
 
     @property
     def world(self) -> str:
@@ -160,8 +162,10 @@ def grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> dict[Any, list[A
 
 def _score_key(one: Evaluation) -> tuple[Any, ...]:
     """Returns the fields of the score that an evaluation counts in."""
-    learned = one.policy == "learned"  # else its run's training does not matter
-    variant = one.variant if learned else Variant(one.variant.preset, one.policy, ())
+    variant = one.variant
+    if one.policy != "learned":  # its run's training does not matter
+        world = tuple(change for change in variant.changed if change[0].startswith(variants.WORLD))
+        variant = Variant(variant.preset, one.policy, world)
     episodes = one.metrics.get("counts", {}).get("episodes", 0)
     return variant, one.policy, one.suite, *variants.world(one.config), one.seed, episodes
 

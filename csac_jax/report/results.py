@@ -93,7 +93,7 @@ class Results(NamedTuple):
 
     runs: list[RecordedRun]
     evaluations: list[Evaluation]
-    notes: list[str]
+    notes: list[str]  # also a line about each benchmark's record
     suites: Sequence[Json] = ()  # evaluations with a digest, and those of records
 
 
@@ -168,7 +168,10 @@ def _add(file: Path, path: Path, results: Results, suites: list[Json]) -> None:
         if found and seal.SHA256 in content:
             suites.append(_intact(content, path))
         elif not found and isinstance(content, dict):
-            suites.extend(_recorded(content))
+            recorded = list(_recorded(content))
+            suites.extend(recorded)
+            abouts = {row["record"]: row["about"] for row in recorded}
+            results.notes.extend(f"record {name}: {text}" for name, text in abouts.items() if text)
     except (OSError, ValueError) as error:
         results.notes.append(f"{path}: damaged ({files.first_line(error)}); left out")
 
@@ -250,12 +253,16 @@ def _intact(content: Json, path: Path) -> Json:
 
 
 def _recorded(content: Json) -> Iterator[Json]:
-    """Yields the evaluations in a benchmark's records, by their suites and parts."""
-    records = [one.get("results") for one in content.values() if isinstance(one, dict)]
-    for row in [row for rows in records if isinstance(rows, list) for row in rows]:
-        if isinstance(row, dict) and row.keys() >= {"suite", "policy", "episodes", "seed"}:
-            _check_part(row)
-            yield {**row, "parts": {row["part"]: row}} if "part" in row else row
+    """Yields the evaluations in a benchmark's records, by their suites and parts, each with its
+    record's name and what it is `about`."""
+    for name, record in content.items():
+        rows = record.get("results") if isinstance(record, dict) else None
+        for row in rows if isinstance(rows, list) else ():
+            if isinstance(row, dict) and row.keys() >= {"suite", "policy", "episodes", "seed"}:
+                _check_part(row)
+                about = " ".join(str(record.get("about", "")).split())
+                named = {"record": name, **row} | {"record": name, "about": about}
+                yield {**named, "parts": {row["part"]: row}} if "part" in row else named
 
 
 def _evaluations(content: Json, file: Path, path: Path) -> list[Evaluation]:

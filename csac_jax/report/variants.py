@@ -29,6 +29,8 @@ DECISION = {"policy.augment": False, "policy.height_bonus": 0.0, "policy.retry_t
 """Settings that `eval` can change, and their values in configs that lack them."""
 VIEW = ("camera.", "sensor.", "heightmap.view", "sim.gripper", "sim.clearance", "sim.opening")
 """Likewise."""
+WORLD = ("sim.", "camera.", "sensor.", "heightmap.")
+"""Sections of what an evaluation acts in, whoever acts."""
 
 Json = dict[str, Any]
 
@@ -76,6 +78,14 @@ def _preset_settings(preset: str, algo: str) -> Json:
 @functools.lru_cache(maxsize=64)  # runs of a folder mostly differ in their seed
 def _settings(text: str) -> Json:
     return configs.flat(configs.to_dict(configs.from_dict(json.loads(text))))
+
+
+def world_settings(config: Json) -> dict[str, str]:
+    """Returns the settings of WORLD by name, as text."""
+    settings = configs.flat(config)
+    with contextlib.suppress(ValueError):  # written by a version with other settings
+        settings = _settings(json.dumps({**config, "seed": 0}))
+    return {name: _text(value) for name, value in settings.items() if name.startswith(WORLD)}
 
 
 def label(variant: Variant, preset: bool = True, most: int | None = None) -> str:

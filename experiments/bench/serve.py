@@ -16,10 +16,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from csac_jax.errors import FailedError
 from examples import camera_image
 from experiments.bench._options import timed
 
@@ -67,7 +68,8 @@ def _ask_until(end: float, port: int, content: bytes) -> list[Reply]:
     return replies
 
 
-def _until_ready(port: int, process: subprocess.Popen[bytes]) -> None:
+def _until_ready(port: int, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
+    """Waits until the service answers. Raises FailedError with the last line of its `errors`."""
     begun = time.perf_counter()
     while process.poll() is None and time.perf_counter() - begun < PATIENCE:
         try:
@@ -75,7 +77,11 @@ def _until_ready(port: int, process: subprocess.Popen[bytes]) -> None:
             return
         except OSError:
             time.sleep(0.1)
-    raise RuntimeError("the service does not answer")
+    code = process.poll()
+    fate = f"no answer in {PATIENCE:.0f} s" if code is None else f"exit code {code}"
+    errors.seek(0)
+    *_, last = ["no line on stderr", *errors.read().decode(errors="replace").splitlines()]
+    raise FailedError(f"the service did not start ({fate}): {last}")
 
 
 def _health(port: int) -> float:
@@ -161,9 +167,10 @@ def measure(seconds: int, port: int) -> dict[str, Any]:
     """Measures all numbers of clients, then a stop."""
     command = [sys.executable, "-m", "csac_jax", "serve", "shipped", "--port", str(port)]
     content, begun = body(), time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    errors = tempfile.TemporaryFile()  # noqa: SIM115  the process keeps it open
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors)
     try:
-        _until_ready(port, process)
+        _until_ready(port, process, errors)
         started = time.perf_counter() - begun
         first = ask(port, content).seconds
         loads = [load(port, content, clients, seconds) for clients in CLIENTS]

@@ -20,7 +20,6 @@ from csac_jax.io import policy_file
 from csac_jax.vision.heightmap import Observation
 from tests.deploy import scenes
 
-pytest.importorskip("flatbuffers")
 pytest.importorskip("jax2onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
 onnxruntime.set_default_logger_severity(3)

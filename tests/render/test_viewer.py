@@ -32,7 +32,7 @@ def counted(*of):
     with window(*of) as show:
         yield lambda data, *of: (seen.append(float(data.xpos[1, 2])), show(data, *of))[1]
 viewer._window = counted
-viewer.play(model, [("up", poses)], print, again=False)
+viewer.play(viewer.Film(model, [("up", poses)]), print, again=False)
 print(seen)
 """
 
@@ -60,16 +60,19 @@ def test_surfaces_are_as_large_as_mujocos(robot: Any):
 @pytest.mark.slow
 def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
     """Claim: `play --viewer` without a display serves a page, whose parts lie where MuJoCo has the
-    geoms in every picture; Ctrl-C ends it."""
+    geoms in every picture; it goes on to the episode of another seed; Ctrl-C ends it."""
     pytest.importorskip("viser")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gl, "has_display", lambda: False)
     monkeypatch.setattr(viewer.time, "sleep", lambda _: None)
     Path("cube.json").write_text(json.dumps({"name": "cube", "blocks": [CUBE]}))
-    show, pages, heights = viewer.Page.show, [], []
+    show, pages, heights, films = viewer.Page.show, [], [], []
 
     def watched(self: viewer.Page, data: mujoco.MjData, text: str, number: int) -> int:
         following = show(self, data, text, number)
+        if isinstance(following, viewer.Film):
+            films.append(following.seed)
+            raise KeyboardInterrupt
         if not pages:
             address = capsys.readouterr().out.split("open ")[1].split(" in a browser")[0]
             pages.append(urllib.request.urlopen(address, timeout=10).status)
@@ -80,7 +83,7 @@ def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
             np.testing.assert_allclose(turn, data.geom_xmat[geom], atol=1e-6)
         heights.append(float(data.qpos[2]))
         if len(heights) == 30:  # 19 pictures an action: the second time
-            raise KeyboardInterrupt
+            self.ask(3)
         return following
 
     monkeypatch.setattr(viewer.Page, "show", watched)
@@ -88,6 +91,8 @@ def test_page_follows_the_motion(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert pages == [200]
     assert len(set(heights)) > 5
     assert heights[19:] == heights[:11]
+    assert films == [3]
+    assert capsys.readouterr().out.count("the table is clear") == 1  # the first was read
 
 
 def test_page_can_be_controlled():
@@ -99,7 +104,7 @@ def test_page_can_be_controlled():
     )
     data, server = mujoco.MjData(tiny), viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
-        page = viewer.Page(server, tiny, 9)
+        page = viewer.Page(server, viewer.Film(tiny, [("up", np.zeros((9, 0)))]))
         assert page.show(data, "up", 3) == 4
         assert page.picture.value == 3
         page.playing.value = False
@@ -110,6 +115,33 @@ def test_page_can_be_controlled():
         assert page.show(data, "up", 7) == 8
         page.choose(0)
         assert page.show(data, "up", 8) == 0
+    finally:
+        server.stop()
+
+
+def test_page_shows_the_scene_of_a_seed():
+    """Claim: the page goes to the episode of a chosen seed: its text and its geoms replace those
+    before, from the first picture on, and it says so while that is simulated."""
+    viser = pytest.importorskip("viser")
+    geom = "<geom size='.1'/>"
+    worlds = [f"<mujoco><worldbody>{n * geom}</worldbody></mujoco>" for n in (1, 3)]
+    one, three = map(mujoco.MjModel.from_xml_string, worlds)
+    server, said = viser.ViserServer(host="127.0.0.1", port=0, verbose=False), []
+
+    def another(seed: int) -> viewer.Film:
+        said.append(page._text.content)
+        return viewer.Film(three, [(f"seed {seed}", np.zeros((5, 0)))], seed)
+
+    try:
+        film = viewer.Film(one, [("first", np.zeros((9, 0)))], seed=4)
+        page = viewer.Page(server, film, another=another)
+        assert (page.seed.value, page.picture.max, list(page.parts)) == (4, 8, [0])
+        page.ask(7)
+        film = page.show(film.data, film.move(3), 3)
+        assert said == ["simulates the episode of seed 7"]
+        assert (page.picture.max, list(page.parts)) == (4, [0, 1, 2])
+        assert page.show(film.data, film.move(0), 0) == 1
+        assert page._text.content == "seed 7"
     finally:
         server.stop()
 

@@ -429,6 +429,39 @@ def test_results_of_others_are_one_table(tmp_path: Path, capsys: pytest.CaptureF
     assert f"{mine}/blocked.json: was changed after it was measured" in line
 
 
+def test_what_looks_alike_says_how_it_differs(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: rows of one suite that were measured by another record, hand or setting say so, and
+    what each record is about; a baseline in another world is no second run of it. Where nothing
+    differs there is no such column."""
+    share = metrics.wilson(8, 10)
+    row = {"suite": "pile", "policy": "a", "episodes": 10, "seed": 0, "completion": share}
+    record = {
+        "weak": {"about": "of 20 N", "results": [{"opening": "full", **row}]},
+        "strong": {"about": "of 100 N", "results": [{"opening": "fit", **row}, row | {"seed": 1}]},
+    }
+    files.write_json(tmp_path / "record.json", record)
+    for opening in ("full", "fit"):
+        config = _config("csac_beta", 0, sim__opening=opening)
+        content = {"policy": "random", "suite": "blocked", "seed": 0, "episodes": 10}
+        content |= dict.fromkeys(results.METRICS, share) | {"config": config}
+        files.write_json(tmp_path / f"{opening}.json", seal.seal(content))
+
+    def told(*names: str) -> str:
+        assert cli.main(["report", *(str(tmp_path / name) for name in names)]) == 0
+        return capsys.readouterr().out
+
+    shown = told(".")
+    column = [line.split("|")[10].strip() for line in shown.splitlines() if "| pile | a" in line]
+    assert column == ["record weak, opening full", "record strong, opening fit", "record strong"]
+    assert "- record strong: of 100 N" in shown
+    assert [shown.count(f"| sim.opening {opening} |") for opening in ("full", "fit")] == [1, 1]
+    evaluated = [line.split("|") for line in shown.splitlines() if line.startswith("| random")]
+    assert len(evaluated) == 2
+    assert {cells[3].strip() for cells in evaluated} == {"c, hand, 0"}
+    assert {cells[4].strip() for cells in evaluated} == {"1"}
+    assert "differs in" not in told("fit.json")
+
+
 def test_digest_covers_the_content(tmp_path: Path):
     """Claim: the digest is SHA-256 of the rest as JSON with sorted keys and no spaces, whatever the
     order and the indentation of the file; content without one passes."""

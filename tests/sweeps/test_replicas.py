@@ -162,7 +162,8 @@ def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
 def test_number_of_parts(monkeypatch: pytest.MonkeyPatch):
     """Claim: on a CPU a part for each; on a GPU two where host and device take turns. One where
     states do not fit twice, for networks that fill a device, and on several devices."""
-    small, large, mjx = presets.paper_small(), presets.paper(), presets.smoke()
+    small, large = presets.paper_small(), presets.paper()
+    mjx = presets.smoke().change(sim={"physics": "mjx"})
     state = sum(replicas.memory.state_bytes(small).values())
     monkeypatch.setattr(replicas.memory, "limit", lambda: 8 * state)
     assert [replicas.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]

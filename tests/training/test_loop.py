@@ -226,13 +226,14 @@ def test_loss_of_the_warm_up_does_not_count(tmp_path: Path):
 def test_warnings_come_once(tmp_path: Path):
     """Claim: physics that fails again and again is logged once, a single failure not at all; the
     build of Warp's kernels is announced, and that MJX compiles long on a CPU."""
+    mjx = CFG.change(sim={"physics": "mjx"})
     warp = CFG.change(scene={"size_jitter": (0.1, 0.0)}, sim={"physics": "warp"})
     cases: Any = (
         ("many", Fake(ill_from=5), CFG, "physics failed", 1),
         ("one", Fake(ill_from=5, ill_to=6), CFG, "physics failed", 0),
         ("warp", Fake(), warp, "Warp builds its kernels", 1),
-        ("mjx", Fake(), CFG, "Warp builds its kernels", 0),
-        ("slow", Fake(), CFG, "MJX compiles for minutes on a CPU", 1),
+        ("mjx", Fake(), mjx, "Warp builds its kernels", 0),
+        ("slow", Fake(), mjx, "MJX compiles for minutes on a CPU", 1),
         ("c", Fake(), CFG.change(sim={"physics": "c"}), "MJX compiles for minutes", 0),
     )
     for name, fake, cfg, text, times in cases:

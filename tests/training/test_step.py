@@ -32,7 +32,8 @@ from csac_jax.vision.heightmap import Observation
 
 pytestmark = pytest.mark.mjx
 
-CFG = presets.smoke().change(replay={"capacity": 1024})  # a ring larger than all else
+MJX = {"physics": "mjx"}  # which speaks to no host
+CFG = presets.smoke().change(sim=MJX, replay={"capacity": 1024})  # a ring larger than all else
 T = CFG.train.chunk
 NUM_SEEN = T * CFG.train.scenes
 HOST = ("callback", "infeed", "outfeed", "device_put", "debug_print")
