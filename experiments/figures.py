@@ -20,7 +20,7 @@ from csac_jax.report.comparison import ResultReport
 from csac_jax.report.figures import Chart
 from csac_jax.report.results import Results
 from csac_jax.report.variants import NAMES
-from experiments import study
+from experiments import summary
 
 plt.rcParams["axes.prop_cycle"] = cycler(color=figures.PALETTE)
 
@@ -85,7 +85,7 @@ def _target() -> ResultReport:
     """Groups what part 1 of the study has of the target task."""
     runs, evaluations = (
         [one for one in every if one.path.parts[-4].startswith("1-target-")]
-        for every in study.read("1")[:2]
+        for every in summary.methods()[:2]
     )
     return comparison.build(Results(runs, evaluations, []))
 
