@@ -174,12 +174,24 @@ def _noisy(actions: Action) -> Action:
     return actions.replace(pose=np.asarray(actions.pose) + noise.astype(np.float32))
 
 
-def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
-    """Runs actions in scenes, leaves [E, ...], as one batch on the config's engine."""
+@functools.cache
+def _programs(config: Config) -> tuple[Any, Any]:
+    """Compiles the height maps and the primitives of a batch of scenes."""
     physics = simulation.make(model.build(config.scene, config.sim), config.sim)
-    height = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))(scenes)
-    run = jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
-    return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
+    heights = jax.vmap(lambda scene: observe.observe(config, scene).height)
+    return jax.jit(heights), jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
+
+
+def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
+    """Runs actions in scenes, leaves [E, ...], on the config's engine, in batches as CASES."""
+    heights, run = _programs(config)
+    results = []
+    for start in range(0, len(scenes.in_play), len(CASES)):
+        rows = jax.tree.map(lambda leaf, at=start: leaf[at : at + len(CASES)], (scenes, actions))
+        height = heights(rows[0])
+        inputs = (rows[0], height, rows[1])
+        results.append(Run(*inputs, *run(*inputs)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)
 
 
 def execute_settled(config: Config, count: int) -> Run:
