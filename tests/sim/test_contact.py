@@ -87,14 +87,18 @@ def test_an_open_hand_sinks_at_most_15_mm_into_a_cube(robot: str):
     world = model.build(cfg.scene, cfg.sim)
     scene = _scene([(0.0, 0.0)], density=LIGHTEST)
     fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
-    height = observe.observe(cfg, jax.tree.map(jnp.asarray, scene), None).height
-    plan = jax.jit(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))
+    height = jax.jit(lambda scene: observe.observe(cfg, scene, None).height)(scene)
+
+    @jax.jit
+    def joints_at(yaw: jax.Array) -> primitives.JointTrajectory:
+        beside = 0.061 * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])  # to the middle of a finger
+        grasp = Action.grasp(*beside, yaw)
+        plan = primitives.plan(cfg.sim, cfg.heightmap, height, grasp)
+        return primitives.joint_trajectory(cfg.sim, plan)
+
     simulator, sinks = c_physics.CSimulator(world), []
     for number in range(24):
-        yaw = number * np.pi / 24
-        beside = 0.061 * np.float32([np.cos(yaw), np.sin(yaw)])  # to the middle of a finger
-        set_points = plan(height, Action.grasp(*beside, yaw))
-        joints = jax.device_get(primitives.joint_trajectory(cfg.sim, set_points))
+        joints = jax.device_get(joints_at(jnp.float32(number * np.pi / 24)))
         assert joints.reachable
         qpos = simulator.rollout(scene, fields, joints).qpos[cfg.sim.grasp_phases[0] - 1]
         sinks.append(2 * HALF - _tips(world, qpos))

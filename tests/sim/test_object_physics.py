@@ -75,12 +75,16 @@ def test_objects_need_a_library():
 
 def _grasp(env: Env, scene: SceneState) -> tuple:
     """The scene, its fields, and the joints of the planner's grasp; NumPy."""
-    state = jax.jit(env.reset_to)(scene)
-    height = state.obs.height
-    grasp = oracle.grasp(CONFIG, state.scene, height)
-    plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp)
-    fields = model.scene_fields(env.physics.world, scene)
-    return jax.device_get((scene, fields, primitives.joint_trajectory(CONFIG.sim, plan)))
+
+    @jax.jit
+    def planned(scene: SceneState) -> tuple:
+        height = env.reset_to(scene).obs.height
+        grasp = oracle.grasp(CONFIG, scene, height)
+        plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp)
+        fields = model.scene_fields(env.physics.world, scene)
+        return scene, fields, primitives.joint_trajectory(CONFIG.sim, plan)
+
+    return jax.device_get(planned(scene))
 
 
 def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
