@@ -179,7 +179,8 @@ def _programs(config: Config) -> tuple[Any, Any]:
     """Compiles the height maps and the primitives of a batch of scenes."""
     physics = simulation.make(model.build(config.scene, config.sim), config.sim)
     heights = jax.vmap(lambda scene: observe.observe(config, scene).height)
-    return jax.jit(heights), jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
+    run = jax.vmap(functools.partial(simulation.execute, physics, config))
+    return jax.jit(heights), jax.jit(run)
 
 
 def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
