@@ -28,6 +28,7 @@ from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.world import placed
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
 VARIED = grippers.load("varied")
@@ -58,7 +59,7 @@ def _scene(fingers: Fingers = THIN) -> SceneState:
 
 
 def _fields(world: model.World, fingers: Fingers) -> model.BlockFields:
-    return jax.tree.map(np.asarray, model.scene_fields(world, _scene(fingers)))
+    return placed.fields_of(world, _scene(fingers))
 
 
 def test_every_episode_has_its_own(env: Env, states: State):

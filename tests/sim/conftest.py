@@ -54,6 +54,17 @@ grasp = functools.partial(act, Primitive.GRASP)
 BAR = np.float32([0.02, 0.04, 0.025])  # m, half sizes of a bar
 
 
+def planned(cfg: Config, height: np.ndarray, action: Action) -> JointTrajectory:
+    """Plans the joints of an action."""
+
+    @jax.jit
+    def joints(height: jax.Array, action: Action) -> JointTrajectory:
+        plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+        return primitives.joint_trajectory(cfg.sim, plan)
+
+    return jax.device_get(joints(height, action))
+
+
 def bar(folder: Path) -> dict[str, Any]:
     """Settings of a scene of one bar of 140 g, from a library in `folder`."""
     corners = BAR * list(itertools.product((-1, 1), repeat=3))
@@ -74,8 +85,7 @@ def grasped_bar(cfg: Config) -> tuple[SceneState, JointTrajectory]:
     if cfg.scene.has_objects:
         scene = scene.replace(object_id=np.int32([0]))
     height = np.full((cfg.heightmap.size,) * 2, 2 * BAR[2])
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, grasp(0.0, 0.0))
-    return scene, jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+    return scene, planned(cfg, height, grasp(0.0, 0.0))
 
 
 TWO_OBJECTS = presets.get("quick").change(
