@@ -69,7 +69,6 @@ pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
 
 figures: $(STAMP)  ## the tables and figures of docs/ that are made from the recorded results
 	$(BIN)/python -m experiments.summary
-	$(BIN)/python -m experiments.study
 	$(BIN)/python -m experiments.figures
 
 docs: $(STAMP)  ## build the site of docs/ into build/docs; only the page "In the browser" needs a network

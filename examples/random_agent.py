@@ -25,7 +25,7 @@ def main(preset="quick", steps="20"):
         state, after = jax.vmap(env.step)(keys_reset, state, action)
         return state, after.info.cleared
 
-    state = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), SCENES))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), SCENES))
     keys = jax.random.split(jax.random.key(1), int(steps))
     _, cleared = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys))(state, keys)
     return jnp.sum(cleared) / cleared.size

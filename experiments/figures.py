@@ -19,8 +19,7 @@ from csac_jax.report import comparison, figures, results
 from csac_jax.report.comparison import ResultReport
 from csac_jax.report.figures import Chart
 from csac_jax.report.results import Results
-from csac_jax.report.variants import NAMES
-from experiments import study
+from experiments import summary
 
 plt.rcParams["axes.prop_cycle"] = cycler(color=figures.PALETTE)
 
@@ -29,8 +28,6 @@ RESULTS, FIGURES = ROOT / "experiments" / "results", ROOT / "docs" / "figures"
 PAPER = {"grasp_only": 0.50, "vpg": 0.75, "csac_per": 0.80, "csac_beta": 0.90}
 """Success over the last 200 grasps of 2,500 actions, text to figures 6 and 7 (CSAC sec. 4.3)."""
 PAPER_ACTIONS = 2500
-PAPER_CASES = ({"vpg": 0.60, "csac_beta": 0.90}, {"vpg": 0.70, "csac_beta": 0.80})
-"""Completion and action efficiency, means of the four cases, figure 9 (CSAC sec. 4.4 and 5)."""
 SAMPLERS = {
     "uniform": "uniform",
     "prioritised": "prioritised",
@@ -54,12 +51,6 @@ OURS = {
 }
 """Suite -> the policy of ours that is for it; those that need pushes first."""
 BOUNDS = {suite: ("random", "planner" if i < 4 else "oracle") for i, suite in enumerate(OURS)}
-CURVES = {
-    "scenes": "scenes side by side",
-    "blocks": "blocks on the table",
-    "map": "cells along a side of the map",
-    "capacity": "capacity of the replay, transitions",
-}
 
 
 def linked() -> set[str]:
@@ -73,7 +64,6 @@ def draw() -> Iterator[tuple[str, Figure]]:
     """Draws all figures and yields them by name."""
     yield "suites", suites()
     yield "replay", replay()
-    yield from steps()
     yield from sweeps()
     for chart in figures.draw(comparison.build(results.read([RESULTS]))):
         yield chart.name, _with_paper(chart)
@@ -85,13 +75,13 @@ def _target() -> ResultReport:
     """Groups what part 1 of the study has of the target task."""
     runs, evaluations = (
         [one for one in every if one.path.parts[-4].startswith("1-target-")]
-        for every in study.read("1")[:2]
+        for every in summary.methods()[:2]
     )
     return comparison.build(Results(runs, evaluations, []))
 
 
 def _with_paper(chart: Chart) -> Figure:
-    """Adds the paper's values to methods on its protocol, and to its four cases."""
+    """Adds the paper's values to methods on its protocol."""
     panels = chart.figure.axes
     if chart.name in ("methods-paper", "methods-paper_small"):
         for algo, value in PAPER.items():
@@ -100,15 +90,6 @@ def _with_paper(chart: Chart) -> Figure:
         panels[0].plot([], [], "wD", markeredgecolor="black", label="paper, 2,500 actions")
         panels[0].legend(**figures.LEGEND)
         panels[0].set_ylim(bottom=min(panels[0].get_ylim()[0], 45))
-    if chart.name.startswith("four-cases-cases-"):
-        for panel, values in zip(panels, PAPER_CASES, strict=True):
-            for algo, value in values.items():
-                style = {"color": figures.COLOURS[algo], "linestyle": "--", "linewidth": 1}
-                panel.axhline(100 * value, label=f"paper, {NAMES[algo]}", **style)
-            panel.set_ylim(bottom=min(panel.get_ylim()[0], 50))
-        chart.figure.legends.clear()
-        handles = panels[0].get_legend_handles_labels()
-        chart.figure.legend(*handles, fontsize="small", loc="outside lower center", ncols=3)
     return chart.figure
 
 
@@ -174,24 +155,6 @@ def replay() -> Figure:
     panels[0].set_ylabel("median per step, \N{MICRO SIGN}s")
     panels[1].legend()
     return figure
-
-
-def steps() -> Iterator[tuple[str, Figure]]:
-    """Draws the time of a training step against what grows, a figure per recorded curve."""
-    for curve, label in CURVES.items():
-        figure, panel = plt.subplots(figsize=(4.8, 3.4), layout="constrained")
-        power = 2 if curve == "map" else 1
-        for record in _read("step", f"-{curve}$"):
-            points = record["points"]
-            sizes, seconds = zip(*((p[curve], p["step_seconds"]) for p in points), strict=True)
-            panel.plot(sizes, seconds, "o-", label=_name(record))
-            proportional = [seconds[0] * (size / sizes[0]) ** power for size in sizes]
-            name = "in proportion" + " to cells" * (power == 2)
-            panel.plot(sizes, proportional, ":", color="grey", label=name)
-        panel.set(xlabel=label, ylabel="time of a training step, s")
-        _plain_logarithms(panel)
-        _finish(panel)
-        yield f"step-{curve}", figure
 
 
 def sweeps() -> Iterator[tuple[str, Figure]]:

@@ -17,6 +17,7 @@ from csac_jax.report.results import Results
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "experiments" / "results"
+STUDY = RESULTS / "study"
 ABOUT = "about.json"
 COMMANDS = (
     "Commands of benchmarks are those of the record's commit: settings and benchmarks may have had "

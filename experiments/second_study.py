@@ -45,7 +45,7 @@ from csac_jax.sweeps.runner import SweepPlan
 from csac_jax.training import own_parts
 from csac_jax.training.own_parts import OwnParts
 from csac_jax.training.progress import Terminal
-from experiments import index, second_tables, study
+from experiments import index, second_tables
 from experiments.samplers import ReaPER, TruncatedGeometric
 
 MAIN, CONTROL, SEARCH = 1000, 1400, 1300  # first seeds
@@ -362,7 +362,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("command", choices=commands)
     parser.add_argument("folder", nargs="?", type=Path, default=Path("runs/second"))
     parser.add_argument("--minutes", type=float, default=9.0, help="of this call of run")
-    parser.add_argument("--archives", type=Path, default=study.ARCHIVES)
+    parser.add_argument("--archives", type=Path, default=index.STUDY)
     parser.add_argument("--jobs", type=int, default=max(1, processes.cores() - RESERVED))
     parser.add_argument("--only", nargs="+", default=["*"], help="patterns of PART/ARM")
     parser.add_argument("--smoke", action="store_true", help="one tiny arm, for a test")

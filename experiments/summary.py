@@ -4,16 +4,17 @@ The page built by `make docs` from `csac-jax report experiments/results` has all
 """
 
 import fnmatch
+import functools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from csac_jax.evaluation import statistics
+from csac_jax.evaluation.suites import IN_DISTRIBUTION
 from csac_jax.report import comparison, result_tables, results
 from csac_jax.report.result_tables import ResultTable, shown
 from csac_jax.report.results import METRICS
 from csac_jax.report.variants import NAMES
-from experiments import study
-from experiments.index import RESULTS
+from experiments.index import RESULTS, STUDY
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.summary`. -->\n"
@@ -84,18 +85,45 @@ def _trained(runs: Sequence[results.RecordedRun]) -> Iterator[dict[str, str]]:
 def _methods() -> ResultTable:
     """Builds the greedy policies of part 1 by task and method."""
     rows = []
-    for task in study.TASKS:
+    for task in ("target", "clear", "packed"):
         for algo in NAMES:
-            pattern, seeds = f"1-{task}-{algo}-*/*", range(100, 150)
-            area = study.values(pattern, study.AREA, seeds)
-            names = (*SHOWN, study.PUSHES)
-            bands = {key: statistics.band([study.values(pattern, key, seeds)]) for key in names}
+            folder = f"1-{task}-{algo}-*"
+            area, names = _area(folder), (*SHOWN, "pushes_per_episode")
+            bands = {key: statistics.band([_evaluated(folder, key)]) for key in names}
             rows.append(
                 {"task": task, "method": NAMES[algo], "seeds": str(len(area))}
                 | {METRICS[key]: shown(band, metric=key) for key, band in bands.items()}
                 | {result_tables.AREA: shown(statistics.band([area]))}
             )
     return rows
+
+
+@functools.cache
+def methods() -> results.Results:
+    """Reads part 1 of the study."""
+    return results.read([STUDY / f"1-methods{results.ARCHIVE}"])
+
+
+def _area(folder: str) -> statistics.Stratum:
+    """Returns the mean success over all actions of each seed of part 1 in such folders."""
+    runs = [run for run in methods().runs if fnmatch.fnmatch(run.path.parts[-4], folder)]
+    areas = [statistics.area(run.actions, run.success, float(run.actions[-1])) for run in runs]
+    return _by_seed(runs, areas)
+
+
+def _evaluated(folder: str, metric: str) -> statistics.Stratum:
+    found = [
+        one
+        for one in methods().evaluations
+        if fnmatch.fnmatch(one.path.parts[-4], folder) and one.suite == IN_DISTRIBUTION
+    ]
+    return _by_seed(found, [one.metrics[metric]["value"] for one in found])
+
+
+def _by_seed(
+    every: Sequence[results.RecordedRun | results.Evaluation], values: Sequence[float]
+) -> statistics.Stratum:
+    return statistics.by_seed([one.config["seed"] for one in every], values)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The public names of the package, and what `train` and `sweep` do with their arguments."""
 
 import dataclasses
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -132,8 +133,10 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     colour, height = rng.uniform(size=(*rows, 3)), 0.1 * rng.uniform(size=rows)
     mask = rng.uniform(size=rows) < np.array([0.0, 0.5, 1.0])[:, None, None]
     obs = Observation(jnp.float32(colour), jnp.float32(height), jnp.array(mask))
-    found = values.dense_maps(actor_critic.make(target), state.online, obs)
-    wanted = values.dense_maps(actor_critic.make(SMOKE), params, obs)
+    found, wanted = (
+        jax.jit(functools.partial(values.dense_maps, actor_critic.make(cfg)))(networks, obs)
+        for cfg, networks in ((target, state.online), (SMOKE, params))
+    )
     np.testing.assert_allclose(found.q, wanted.q, rtol=1e-5, atol=1e-5)
     _assert_same(state.target, state.online)
 

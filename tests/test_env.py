@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import pytest
 
 from csac_jax.agent import rewards
 from csac_jax.baselines import oracle
-from csac_jax.config import Config, SceneConfig, TaskConfig
+from csac_jax.config import Config, PhysicsKind, SceneConfig, SimConfig, TaskConfig
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.robot.primitives import Action
@@ -31,7 +31,7 @@ class ShortTask(TaskConfig):
 
 
 SCENE = SceneConfig(slots=("box", "box", "prism"), min_blocks=2, pool=16, settle_time=1.5)
-CONFIG = Config(scene=SCENE, task=ShortTask(max_actions=6))
+CONFIG = Config(scene=SCENE, task=ShortTask(max_actions=6), sim=SimConfig(physics="c"))
 FAILED = 3  # grasps before the actions of `_CASES`
 SCENES = 8
 BARE = (0.15, 0.15, 0.0)  # x, y and yaw of a place where nothing lies
@@ -51,12 +51,21 @@ class Lab(NamedTuple):
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("pool")))
-        env = make_env(CONFIG)
+        return _compiled(make_env(CONFIG))
 
+
+def _compiled(env: Env) -> Lab:
     def plan(state: State) -> Action:
         return oracle.grasp(CONFIG, state.scene, state.obs.height)
 
     return Lab(env, *(jax.jit(jax.vmap(run)) for run in (env.reset, env.reset_to, env.step, plan)))
+
+
+def _in(physics: PhysicsKind, env: Env) -> Env:
+    """The environment in another engine."""
+    cfg = CONFIG.change(sim={"physics": physics})
+    engine = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
+    return dataclasses.replace(env, cfg=cfg, physics=engine)
 
 
 def _cube(x: float, y: float, target: int = scene_state.ANY) -> SceneState:
@@ -208,16 +217,10 @@ def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
     np.testing.assert_array_equal(ends.done, np.arange(SCENES) == 0)
 
 
-def _in_c(lab: Lab, **changes: Any) -> Env:
-    cfg = CONFIG.change(sim={"physics": "c"})  # which compiles sooner
-    physics = simulation.make(model.build(cfg.scene, cfg.sim), cfg.sim)
-    return dataclasses.replace(lab.env, cfg=cfg, physics=physics, **changes)
-
-
 def test_failures_end_an_episode(lab: Lab):
     """Claim: with `max_failures` that many failed grasps in a row truncate an episode."""
-    env = _in_c(lab, max_failures=2)
-    state, step = env.reset_to(_cube(0.0, 0.0)), jax.jit(env.step)
+    env = dataclasses.replace(lab.env, max_failures=2)
+    state, step = jax.jit(env.reset_to)(_cube(0.0, 0.0)), jax.jit(env.step)
     for failed, stops in ((0, False), (1, True)):
         after = step(state.replace(failed_grasps=jnp.int32(failed)), Action.grasp(*BARE))
         assert (bool(after.truncated), bool(after.terminated)) == (stops, False)
@@ -227,17 +230,17 @@ def test_failures_end_episodes_of_certified_scenes(lab: Lab):
     """Claim: of a pool with certified and other scenes, failed grasps in a row end the episodes in
     certified ones alone, in every engine. A scene that is not of the pool is none."""
     scene = {"certified": ("blocked",), "certified_fraction": 0.5}
-    env = _in_c(lab, max_failures=2)
-    env = dataclasses.replace(env, cfg=env.cfg.change(scene=scene))
-    mjx = dataclasses.replace(env, cfg=CONFIG.change(scene=scene), physics=lab.env.physics)
+    env = dataclasses.replace(lab.env, max_failures=2, cfg=CONFIG.change(scene=scene))
+    mjx = _in("mjx", env)
+    mjx = dataclasses.replace(mjx, cfg=mjx.cfg.change(scene=scene))
     step, action = jax.jit(env.step), Action.grasp(*BARE)
     for certified in (None, False, True):
         flag = None if certified is None else jnp.asarray(certified)
         state = env.reset_to(_cube(0.0, 0.0).replace(certified=flag))
         state = state.replace(failed_grasps=jnp.int32(1))
         assert bool(step(state, action).truncated) == bool(certified)
-        shapes = jax.eval_shape(mjx.step, state, action)
-        assert jax.tree.structure(shapes) == jax.tree.structure(state)
+    shapes = jax.eval_shape(mjx.step, state, action)
+    assert jax.tree.structure(shapes) == jax.tree.structure(state)
 
 
 def test_oracle_clears_scenes(lab: Lab):
@@ -331,7 +334,7 @@ def _spoil(state: State, action: Action, where: str, value: float, sick: int) ->
 
 _ENTRIES = ("position", "quaternion", "velocity", "half_size", "density", "friction", "colour")
 _SPOILT = [
-    ("action.pose", np.nan),
+    *(("action.pose", value) for value in (np.nan, np.inf)),
     *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[i % 3]) for i, leaf in enumerate(_ENTRIES)),
     *((f"scene.{leaf}", (np.nan, np.inf, 1e6)[(i + 1) % 3]) for i, leaf in enumerate(_ENTRIES[:6])),
     ("scene.target", 1e6),
@@ -341,9 +344,11 @@ _SPOILT = [
 ]
 
 
-def test_failed_physics_stays_in_its_scene(lab: Lab):
+@pytest.mark.parametrize("physics", ["c", pytest.param("mjx", marks=pytest.mark.slow)])
+def test_failed_physics_stays_in_its_scene(lab: Lab, physics: PhysicsKind):
     """Claim: NaN, infinity or 1e6 in a scene truncates it as diverged, the others are the same, bit
     for bit. An invalid scene is replaced by an empty one; a valid one stays as it was."""
+    lab = lab if physics == "c" else _compiled(_in(physics, lab.env))
     state = lab.reset(jax.random.split(jax.random.key(4), SCENES))
     action = lab.oracle(state)
     good = lab.step(state, action)
@@ -370,20 +375,6 @@ def _assert_replaced(diverged: State, before: SceneState, where: str) -> None:
         assert np.isfinite(leaf).all(), where
     expected = before if where == "action.pose" else scene_state.parked(CONFIG.scene.slots)
     jax.tree.map(np.testing.assert_array_equal, diverged.scene, expected)
-
-
-def test_pose_that_is_no_number_fails_in_c(lab: Lab):
-    """Claim: NaN in an action is failed physics in C, too, in its scene alone."""
-    env = _in_c(lab)
-    scenes = _stack(*[_cube(0.0, 0.0)] * 3)
-    poses = (0.0, 0.0, 0.0), (np.nan, 0.0, 0.0), (0.0, 0.0, np.inf)
-    actions = _actions(*[(Primitive.GRASP, pose) for pose in poses])
-    first_step = jax.vmap(lambda scene, action: env.step(env.reset_to(scene), action))
-    after = jax.jit(first_step)(scenes, actions)
-    assert after.info.physics_diverged.tolist() == [False, True, True]
-    assert after.info.cleared.tolist() == [1, 0, 0]
-    for index in (1, 2):
-        _assert_replaced(_at(after, index), _at(scenes, index), "action.pose")
 
 
 def test_step_is_a_fixed_point_of_types(lab: Lab):

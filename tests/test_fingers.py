@@ -28,6 +28,7 @@ from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.world import placed
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
 VARIED = grippers.load("varied")
@@ -49,7 +50,8 @@ def states(env: Env) -> State:
 
 
 def _networks(cfg: Config) -> Params:
-    return actor_critic.init(jax.random.key(1), actor_critic.make(cfg)).online
+    learner = actor_critic.make(cfg)
+    return jax.jit(lambda key: actor_critic.init(key, learner).online)(jax.random.key(1))
 
 
 def _scene(fingers: Fingers = THIN) -> SceneState:
@@ -58,7 +60,7 @@ def _scene(fingers: Fingers = THIN) -> SceneState:
 
 
 def _fields(world: model.World, fingers: Fingers) -> model.BlockFields:
-    return jax.tree.map(np.asarray, model.scene_fields(world, _scene(fingers)))
+    return placed.fields_of(world, _scene(fingers))
 
 
 def test_every_episode_has_its_own(env: Env, states: State):
@@ -73,11 +75,11 @@ def test_every_episode_has_its_own(env: Env, states: State):
     np.testing.assert_array_equal(states.obs.fingers, drawn)
     assert all(env.observation_spec.fingers.contains(row) for row in drawn)
     plain = dataclasses.replace(env, cfg=CONFIG.change(sim={"gripper": "rg2"}))
-    one = plain.reset(jax.random.key(0))
+    one = jax.jit(plain.reset)(jax.random.key(0))
     assert one.scene.fingers is None
     np.testing.assert_allclose(one.obs.fingers, [0.11, 0.012, 0.02])
     blind = dataclasses.replace(env, cfg=CONFIG.change(net={"gripper": False}))
-    assert blind.reset(jax.random.key(0)).obs.fingers is None
+    assert jax.eval_shape(blind.reset, jax.random.key(0)).obs.fingers is None
 
 
 @pytest.mark.slow
@@ -125,7 +127,8 @@ def test_pads_in_mujoco(fingers: Fingers):
     own = model.with_blocks(world, _fields(world, fingers))
     data = mujoco.MjData(own)
     plan = _plan(fingers)
-    data.qpos[world.robot_qpos] = primitives.joint_trajectory(CONFIG.sim, plan).start
+    joints = jax.jit(functools.partial(primitives.joint_trajectory, CONFIG.sim))(plan)
+    data.qpos[world.robot_qpos] = joints.start
     mujoco.mj_kinematics(own, data)
     low, high = world.hand_geoms[1:]
     apart = np.linalg.norm((data.geom_xpos[high] - data.geom_xpos[low])[:2])
@@ -141,7 +144,7 @@ def _plan(fingers: Fingers | None) -> primitives.Plan:
     height = jnp.zeros((32, 32)).at[14:18, 14:18].set(0.05)
     grasp = Action.grasp(0.0, 0.0, 0.3)
     sim = dataclasses.replace(CONFIG.sim, opening="full")
-    return primitives.plan(sim, CONFIG.heightmap, height, grasp, fingers)
+    return jax.jit(lambda f: primitives.plan(sim, CONFIG.heightmap, height, grasp, f))(fingers)
 
 
 def test_hand_opens_as_far_as_the_fingers():
@@ -211,10 +214,16 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
     for cfg in (CONFIG, CONFIG.change(task={"kind": "target"})):
         start: Any = api.initial_networks(cfg, path)
         learner = actor_critic.make(cfg)
-        found = start(actor_critic.init(jax.random.key(3), learner)).online
+        fresh = jax.jit(lambda key, learner=learner: actor_critic.init(key, learner))
+        found = start(fresh(jax.random.key(3))).online
         obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
-        seen = values.dense_maps(actor_critic.make(blind), params, obs.replace(fingers=None))
-        both = values.dense_maps(learner, found, obs)
+        seen, both = (
+            jax.jit(functools.partial(values.dense_maps, learner))(params, obs)
+            for learner, params, obs in (
+                (actor_critic.make(blind), params, obs.replace(fingers=None)),
+                (learner, found, obs),
+            )
+        )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
     assert api.match_networks(CONFIG, "shipped").net.gripper
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):

@@ -57,13 +57,6 @@ def difference(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0
     return _bands(_pair(ours, theirs), _gap, seed)[0]
 
 
-def p_value(ours: Sequence[Stratum], theirs: Sequence[Stratum], seed: int = 0) -> float:
-    """Returns the two-sided bootstrap p-value of no `difference`, from the same draws."""
-    gaps = _gap(*_draws(_pair(ours, theirs), seed))
-    rarer = min(np.sum(gaps <= 0.0), np.sum(gaps >= 0.0))
-    return min(2.0 * (1.0 + float(rarer)) / (1.0 + len(gaps)), 1.0)
-
-
 def holm(p_values: Sequence[float], alpha: float = 0.05) -> list[bool]:
     """Tells which of several tests stay significant together (Holm 1979, step down)."""
     order = np.argsort(p_values, kind="stable")

@@ -69,21 +69,3 @@ def config(name: str, preset: str, flags: Sequence[str]) -> Config:
         return settings.parse(_Run, f"bench {name}", settings.base(preset, flags), flags)[1]
     except SettingsError as error:
         raise SettingsError(f"bench {name}: {error}") from None
-
-
-def with_blocks(cfg: Config, num: int) -> Config:
-    """Returns the config with `num` dropped blocks of its kinds, and contacts to match."""
-    slots = cfg.scene.slots
-    share = num / len(slots)
-    return cfg.change(
-        scene={
-            "slots": tuple(slots[i % len(slots)] for i in range(num)),
-            "min_blocks": num,
-            "pool": min(cfg.scene.pool, 64),
-            "packed_fraction": 0.0,
-        },
-        sim={
-            "geom_pairs": max(round(share * cfg.sim.geom_pairs), 4),
-            "contacts": max(round(share * cfg.sim.contacts), 16),
-        },
-    )

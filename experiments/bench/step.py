@@ -1,16 +1,11 @@
 """Times the stages of a training step, as JSON: `csac-jax bench step [PRESET] [--physics
-mjx|warp|c|auto] [--steps N] [--repeats N] [--curve scenes|blocks|map|capacity --smallest A
---largest B] [SETTING ...]`, PRESET `quick` if none is given, physics `auto`, settings as `csac-jax
-train` takes them: `--learn.updates_per_step 64`.
+mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`, PRESET `quick` if none is given, physics
+`auto`, settings as `csac-jax train` takes them: `--learn.updates_per_step 64`.
 
 Each stage of `train_step` is compiled by itself. It is timed beside the whole step, a compiled loop
 of STEPS (2) steps as in training, and beside a bare loop of the engine's own steps of the same
 scenes and set-points. Calls take turns in one process, and the median of REPEATS (5) rounds counts,
 so other load slows all alike. Trust ratios.
-
-With --curve the whole step alone is timed at A, 2 A, 4 A .. B scenes, blocks, cells along a side of
-the map, or transitions in the ring; contact caps grow with the blocks. On an accelerator,
-`peak_bytes` is of all measured so far.
 """
 
 import argparse
@@ -40,10 +35,9 @@ from csac_jax.sim import backend
 from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.vision import heightmap
 from experiments.bench import _bare
-from experiments.bench._options import Parser, config, emit, split, with_blocks
+from experiments.bench._options import Parser, config, emit, split
 from experiments.bench._timing import medians
 
-CURVES = {"scenes": (1, 16), "blocks": (1, 8), "map": (32, 128), "capacity": (1024, 65536)}
 _SEPARATE = ("dense_maps", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
@@ -219,43 +213,14 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     }
 
 
-def _at(cfg: Config, curve: str, value: int) -> Config:
-    """Returns the config with `value` scenes, blocks, cells along a side or transitions."""
-    if curve == "scenes":
-        capacity = max(cfg.replay.capacity, value)
-        return cfg.change(train={"scenes": value}, replay={"capacity": capacity})
-    if curve == "map":
-        return cfg.change(heightmap={"size": value})
-    if curve == "capacity":
-        return cfg.change(replay={"capacity": value})
-    return with_blocks(cfg, value)
-
-
-def _point(cfg: Config, curve: str, value: int, steps: int, repeats: int) -> dict[str, Any]:
-    """Times one point of a curve: the whole step alone."""
-    program = programs.make(cfg)
-    state = programs.init(program)
-    chunk, compiling = _compile(program, state, steps)
-    seconds = medians({"whole": _whole(chunk, cfg, state)}, repeats)["whole"] / steps
-    row = {curve: value, "step_seconds": seconds, "compile_seconds": compiling}
-    return row | _rates(cfg, seconds) | _memory(chunk)
-
-
 def _parse(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
     parser = Parser(prog="bench step", allow_abbrev=False)
     parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"))
-    parser.add_argument("--curve", choices=tuple(CURVES))
-    for name, default in {"steps": 2, "repeats": 5, "smallest": 0, "largest": 0}.items():
+    for name, default in {"steps": 2, "repeats": 5}.items():
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
     if min(options.steps, options.repeats) < 1:
         parser.error("--steps, --repeats: at least 1")
-    smallest, largest = CURVES.get(options.curve, (0, 0))
-    options.smallest, options.largest = options.smallest or smallest, options.largest or largest
-    if options.curve and not 1 <= options.smallest <= options.largest:
-        parser.error("--smallest, --largest: 1 <= smallest <= largest is needed")
-    if not options.curve and options.largest + options.smallest:
-        parser.error("--smallest and --largest belong to --curve")
     return preset, options, flags
 
 
@@ -271,19 +236,12 @@ def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Confi
 def main(arguments: list[str]) -> None:
     """Prints the result."""
     preset, options, flags = _parse(arguments)
-    curve, steps, repeats = options.curve, options.steps, options.repeats
-    sizes = [options.smallest << i for i in range(32) if options.smallest << i <= options.largest]
+    steps, repeats = options.steps, options.repeats
     try:
         cfg = _config(preset, flags, options.physics)
-        points = {size: _at(cfg, curve, size) for size in sizes if curve}
     except ValueError as error:
         raise SettingsError(f"bench step: {error}") from None
     result = {"preset": preset, "settings": flags, "physics": cfg.sim.physics}
     result |= {"scenes": cfg.train.scenes, "steps": steps, "repeats": repeats}
-    if curve:
-        rows = [_point(point, curve, size, steps, repeats) for size, point in points.items()]
-        result |= {"curve": curve, "points": rows}
-    else:
-        result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates_per_step}
-        result |= measure(cfg, steps, repeats)
-    emit(result)
+    result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates_per_step}
+    emit(result | measure(cfg, steps, repeats))

@@ -1,6 +1,7 @@
 """Dense maps: where their cells lie, and reading them at an action."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -190,6 +191,6 @@ def test_best_over_yaws(frames):
     valid[PUSH, 3, 9, 6] = valid[GRASP, 3, 9, 6] = True
     state = maps.DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
     places = jnp.asarray(np.stack([frames.xy[3, 9, 6], frames.xy[1, 9, 9]]).reshape(2, 1, 2))
-    best = maps.best_over_yaws(frames, state, places)
+    best = jax.jit(functools.partial(maps.best_over_yaws, frames))(state, places)
     assert_allclose(best[:, 0, 0], [1.0, 0.5], atol=1e-5)
     assert np.all(np.isneginf(best[:, 1, 0]))

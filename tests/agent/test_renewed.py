@@ -43,9 +43,13 @@ def renewing(cfg) -> ActorCritic:
     return actor_critic.make(cfg.change(reward={"push_label": "current_critic"}), Height())
 
 
+def _begun(learner: ActorCritic) -> actor_critic.LearnerState:
+    return jax.jit(lambda key: actor_critic.init(key, learner))(jax.random.key(0))
+
+
 def _weighted(learner: ActorCritic, weight: jax.Array | float) -> actor_critic.LearnerState:
     """Its state with a target network of this weight."""
-    state = actor_critic.init(jax.random.key(0), learner)
+    state = _begun(learner)
     critic = jax.tree.map(lambda leaf: jnp.full_like(leaf, weight), state.target.critic)
     return state.replace(target=state.target.replace(critic=critic))
 
@@ -95,7 +99,7 @@ def test_stored_label_stays_as_an_option(cfg, observations):
 @pytest.mark.parametrize("num", [1, 5])
 def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
     """Claim: in parts of the batch phi_g is what it is all at once, and 0 where nobody asks."""
-    state = randomised(actor_critic.init(jax.random.key(0), learner))
+    state = randomised(_begun(learner))
     obs = observations(num, 3)
     all_maps = jax.jit(lambda: values.dense_maps(learner, state.target, obs))()
     phi = jax.vmap(values.best_grasp)(all_maps)
@@ -108,7 +112,7 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
 
 def test_replicas_ask_for_the_neediests_quarters(learner, randomised, observations, monkeypatch):
     """Claim: under vmap phi_g is what it is alone, in as many quarters as one replica asks for."""
-    state = randomised(actor_critic.init(jax.random.key(0), learner))
+    state = randomised(_begun(learner))
     obs, dense_maps = observations(8, 3), values.dense_maps
     wanted = np.zeros((3, 8), bool)
     wanted[0, [1, 6]] = wanted[1, [0, 3, 7]] = True  # one quarter of two, two quarters, none

@@ -2,8 +2,6 @@
 configs."""
 
 import json
-import re
-import shlex
 from pathlib import Path
 from typing import Any
 
@@ -236,26 +234,3 @@ def test_devices_of_other_processes_count():
         command._devices(command.SweepOptions(**one))
         for one in ({}, {"devices": 1}, {"processes": 1})
     } == {1}
-
-
-def _study_commands() -> list[list[str]]:
-    """Returns the arguments of every sweep of docs/study.md, with its shell variables."""
-    page = (Path(cli.__file__).parents[2] / "docs" / "study.md").read_text()
-    values = dict(re.findall(r'^    (\w+)="(.*)"$', page, re.MULTILINE))
-    lines = re.findall(r"^    \$S (.*)$", page, re.MULTILINE)
-    fill = lambda line: re.sub(r"\$(\w+)", lambda found: values[found[1]], line)  # noqa: E731
-    return [shlex.split(fill(f"$S {line}"))[2:] for line in lines]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arguments", _study_commands(), ids=lambda words: words[8])
-def test_study_can_begin_and_go_on(arguments: list[str], tmp_path: Path):
-    """Claim: every sweep of the study is one that can begin, in a folder of its own, with seeds 100
-    to 149 that no search uses, and that is read back as it was planned."""
-    options, plan = command.read(arguments)
-    assert arguments[0] == "paper_small"
-    assert [words[8] for words in _study_commands()].count(str(options.run_dir)) == 1
-    seeds = {cfg.seed for cfg in runner.runs_of(plan).values()}
-    assert (seeds, plan.episodes) == (set(range(100, 150)), 500)
-    (tmp_path / "sweep.json").write_text(runner.plan_text(plan))
-    assert runner.read_plan(tmp_path) == plan

@@ -121,9 +121,13 @@ def test_pushes_are_judged_by_the_next_image(policy: CameraPolicy, tmp_path: Pat
 
 def _q(policy: CameraPolicy, obs: Any, primitive: Any, pose: Any) -> float:
     learner = actor_critic.make(policy.cfg)
-    batch = values.dense_maps(learner, policy.params, jax.tree.map(lambda x: x[None], obs))
-    state = jax.tree.map(lambda leaf: leaf[0], batch)
-    return float(maps.read(learner.frames, state.q, primitive, pose))
+
+    @jax.jit
+    def read(params: Any, obs: Any, primitive: Any, pose: Any) -> jax.Array:
+        batch = values.dense_maps(learner, params, jax.tree.map(lambda x: x[None], obs))
+        return maps.read(learner.frames, batch.q[0], primitive, pose)
+
+    return float(read(policy.params, obs, primitive, pose))
 
 
 SETTINGS = Settings(updates=100, learning_rate=1e-2, batch=8)

@@ -70,11 +70,16 @@ def test_width_is_the_simulated_opening(policy: CameraPolicy):
     image = scenes.take(scenes.blocks_at([[0.0, y, 0.0] for y in (-0.08, 0.0, 0.08)]))
     policy = CameraPolicy(policy.cfg.change(sim={"opening": "fit"}), policy.params, WORKSPACE)
     decided, height = policy.decide(*image, top=3), policy.observe(*image).height
+
+    @jax.jit
+    def joints(x: float, y: float, yaw: float) -> jax.Array:
+        plan = primitives.plan(
+            policy.cfg.sim, policy.cfg.heightmap, height, Action.grasp(x, y, yaw)
+        )
+        return primitives.joint_trajectory(policy.cfg.sim, plan).start
+
     for decision in decided:
-        chosen = Action.grasp(*decision.position[:2], decision.yaw)
-        plan = primitives.plan(policy.cfg.sim, policy.cfg.heightmap, height, chosen)
-        joints = primitives.joint_trajectory(policy.cfg.sim, plan).start
-        gap = grippers.load("rg2").gap(float(joints[4]))
+        gap = grippers.load("rg2").gap(float(joints(*decision.position[:2], decision.yaw)[4]))
         assert decision.width == pytest.approx(gap, abs=1e-5)
     assert min(decision.width for decision in decided) < 0.1
 

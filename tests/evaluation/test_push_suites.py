@@ -99,13 +99,13 @@ def test_hidden_shows_what_its_parts_say():
     fine = next(iter(parts.values())).cfg.change(heightmap={"size": 128})
     look = jax.jit(functools.partial(observe.observe, fine))
     for name, env in parts.items():
+        share_seen = jax.jit(functools.partial(observe.seen_share, env.cfg.scene))
         low, high = {"seen_50_100": (0.5, 1.0), "seen_1_50": (0.01, 0.5), "seen_0": (0, 0)}[name]
         for row in range(min(len(env.scenes.target), 4)):
             scene = _scene(env, row)
             share = _share_in_c(world, scene)
             assert low - 0.02 <= share <= high + 0.02, name
-            ours = float(observe.seen_share(env.cfg.scene, jax.tree.map(jnp.asarray, scene)))
-            assert ours == pytest.approx(share, abs=0.05)
+            assert float(share_seen(scene)) == pytest.approx(share, abs=0.05)
             mask = np.asarray(look(scene).target)
             assert mask.any() == (name != "seen_0") or 0.0 < share < 0.05
 

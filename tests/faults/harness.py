@@ -1,7 +1,7 @@
 """Faults that are injected by the hundred, and the result of each try.
 
 A fault is a function (tally, rng, tries, folder), named by `@fault`. `make test-faults` injects
-all; `make test` a tenth, in `test_faults.py`. The modules in MODULES register them.
+all; `make test` a twentieth, in `test_faults.py`. The modules in MODULES register them.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ import numpy as np
 
 MODULES = ("runs", "inputs")  # of this folder
 ROOT = Path(__file__).parents[2]  # of the repository
-SHARE = 10  # `make test` injects one try in so many
+SHARE = 20  # `make test` injects one try in so many
 HANG = 10.0  # s: an answer that takes longer, beyond what the work itself needs, is a hang
 
 

@@ -1,4 +1,4 @@
-"""A tenth of the fault-injection suite; `make test-faults` injects all of it."""
+"""A twentieth of the fault-injection suite; `make test-faults` injects all of it."""
 
 import zlib
 from pathlib import Path

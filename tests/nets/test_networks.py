@@ -135,12 +135,13 @@ def test_mirrored_maps_are_the_mean_of_four_looks():
     scene's Q, pushes ahead and back swapped along it; and it is the mean of four looks."""
     nets = networks.make(TINY["small"])
     passes = jax.random.normal(jax.random.key(0), (2, 3, 24, 24, 4))
-    variables, noise = nets.critic.init(jax.random.key(1), passes[0]), np.random.default_rng(2)
+    variables = jax.eval_shape(nets.critic.init, jax.random.key(1), passes[0])
+    noise = np.random.default_rng(2)
     variables = jax.tree.map(
         lambda leaf: jnp.asarray(0.3 * noise.normal(size=leaf.shape), jnp.float32), variables
     )
-    look = functools.partial(networks.apply, nets, variables)
-    mirrored = functools.partial(networks.apply_mirrored, nets, variables)
+    look = jax.jit(functools.partial(networks.apply, nets, variables))
+    mirrored = jax.jit(functools.partial(networks.apply_mirrored, nets, variables))
     q, features = mirrored(passes)
     plain, expected = look(passes)
     assert_allclose(features, expected, atol=1e-5)

@@ -28,7 +28,7 @@ from csac_jax.report.comparison import ResultReport
 
 CASES = ("hole", "row")
 PUSHES = Path(__file__).parents[2] / "experiments" / "results" / "bench" / "push_suites.json"
-MANY = {"net__head": 16, "learn__batch": 4, "learn__tau": 0.5, "cem__rounds": 1}
+MANY = {"net__head": 16, "learn__batch": 4, "learn__tau": 0.5, "cem__start": "actor"}
 MANY |= {"learn__updates_per_step": 9, "target__gamma": 0.1, "train__actions": 90}
 
 

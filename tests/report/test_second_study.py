@@ -21,7 +21,7 @@ from csac_jax.cli import failures
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files
 from csac_jax.sweeps import runner
-from experiments import index, second_study, second_tables, study
+from experiments import index, second_study, second_tables
 
 ROOT = Path(__file__).parents[2]
 PROTOCOL = (ROOT / "docs" / "study-protocol.md").read_text()
@@ -317,7 +317,7 @@ def test_claims_by_hand(recorded: Callable[..., Path], tmp_path: Path):
 def test_cells_are_recomputed(recorded: Callable[..., Path]):
     """Claim: ten cells of the tables follow from the archives by another way: plain JSON, SciPy's
     trimmed mean, a sorted quarter. Without archives of the study, from made ones."""
-    archives = study.ARCHIVES
+    archives = index.STUDY
     if not list(archives.glob("second-*.tar.xz")):
         places = [arm.place for arm in second_study.arms() if arm.part in ("pushes", "settings")]
         spots = [(place, s, "alike") for place in places for s in ("enclosed", "target")]

@@ -250,7 +250,7 @@ def test_poured_blocks_that_leave_are_dropped_anew():
     world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
     for _ in range(6):
         scene = pool._drop(cfg, rng, 4)
-        fields = jax.device_get(model.scene_fields(world, scene))
+        fields = placed.fields_of(world, scene)
         poured = pool.pour(world, Config(scene=cfg), scene, fields)
         assert poured is not None
         assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()

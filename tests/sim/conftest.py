@@ -54,6 +54,17 @@ grasp = functools.partial(act, Primitive.GRASP)
 BAR = np.float32([0.02, 0.04, 0.025])  # m, half sizes of a bar
 
 
+def planned(cfg: Config, height: np.ndarray, action: Action) -> JointTrajectory:
+    """Plans the joints of an action."""
+
+    @jax.jit
+    def joints(height: jax.Array, action: Action) -> JointTrajectory:
+        plan = primitives.plan(cfg.sim, cfg.heightmap, height, action)
+        return primitives.joint_trajectory(cfg.sim, plan)
+
+    return jax.device_get(joints(height, action))
+
+
 def bar(folder: Path) -> dict[str, Any]:
     """Settings of a scene of one bar of 140 g, from a library in `folder`."""
     corners = BAR * list(itertools.product((-1, 1), repeat=3))
@@ -74,8 +85,7 @@ def grasped_bar(cfg: Config) -> tuple[SceneState, JointTrajectory]:
     if cfg.scene.has_objects:
         scene = scene.replace(object_id=np.int32([0]))
     height = np.full((cfg.heightmap.size,) * 2, 2 * BAR[2])
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, grasp(0.0, 0.0))
-    return scene, jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+    return scene, planned(cfg, height, grasp(0.0, 0.0))
 
 
 TWO_OBJECTS = presets.get("quick").change(
@@ -174,12 +184,25 @@ def _noisy(actions: Action) -> Action:
     return actions.replace(pose=np.asarray(actions.pose) + noise.astype(np.float32))
 
 
-def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
-    """Runs actions in scenes, leaves [E, ...], as one batch on the config's engine."""
+@functools.cache
+def _programs(config: Config) -> tuple[Any, Any]:
+    """Compiles the height maps and the primitives of a batch of scenes."""
     physics = simulation.make(model.build(config.scene, config.sim), config.sim)
-    height = jax.jit(jax.vmap(lambda scene: observe.observe(config, scene).height))(scenes)
-    run = jax.jit(jax.vmap(functools.partial(simulation.execute, physics, config)))
-    return jax.tree.map(np.asarray, Run(scenes, height, actions, *run(scenes, height, actions)))
+    heights = jax.vmap(lambda scene: observe.observe(config, scene).height)
+    run = jax.vmap(functools.partial(simulation.execute, physics, config))
+    return jax.jit(heights), jax.jit(run)
+
+
+def execute(config: Config, scenes: SceneState, actions: Action) -> Run:
+    """Runs actions in scenes, leaves [E, ...], on the config's engine, in batches as CASES."""
+    heights, run = _programs(config)
+    results = []
+    for start in range(0, len(scenes.in_play), len(CASES)):
+        rows = jax.tree.map(lambda leaf, at=start: leaf[at : at + len(CASES)], (scenes, actions))
+        height = heights(rows[0])
+        inputs = (rows[0], height, rows[1])
+        results.append(Run(*inputs, *run(*inputs)))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *results)
 
 
 def execute_settled(config: Config, count: int) -> Run:

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from csac_jax.robot import primitives
 from csac_jax.sim import c_physics
 from csac_jax.sim.c_physics import CPhysics, Trajectory
 from csac_jax.world import model, scene_state
@@ -23,9 +22,8 @@ def pushed(c_world: model.World) -> tuple:
     cfg = conftest.CONFIG
     scene = conftest.place(cube=(0.06, 0.0, 0.0))
     action = jax.tree.map(jnp.asarray, conftest.push(0.0, 0.0))
-    plan = primitives.plan(cfg.sim, cfg.heightmap, jnp.zeros((cfg.heightmap.size,) * 2), action)
     fields = jax.device_get(model.scene_fields(c_world, scene))
-    return scene, fields, jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+    return scene, fields, conftest.planned(cfg, np.zeros((cfg.heightmap.size,) * 2), action)
 
 
 def _assert_equal(ours: Trajectory, theirs: Trajectory) -> None:

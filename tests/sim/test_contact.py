@@ -22,6 +22,8 @@ from csac_jax.sim import c_physics, outcome, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.sim.conftest import planned
+from tests.world import placed
 
 HALF = 0.025  # m, of a cube
 pytestmark = pytest.mark.mjx
@@ -86,15 +88,19 @@ def test_an_open_hand_sinks_at_most_15_mm_into_a_cube(robot: str):
     cfg = _config(1, robot=robot)
     world = model.build(cfg.scene, cfg.sim)
     scene = _scene([(0.0, 0.0)], density=LIGHTEST)
-    fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
-    height = observe.observe(cfg, jax.tree.map(jnp.asarray, scene), None).height
-    plan = jax.jit(functools.partial(primitives.plan, cfg.sim, cfg.heightmap))
+    fields = placed.fields_of(world, scene)
+    height = jax.jit(lambda scene: observe.observe(cfg, scene, None).height)(scene)
+
+    @jax.jit
+    def joints_at(yaw: jax.Array) -> primitives.JointTrajectory:
+        beside = 0.061 * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])  # to the middle of a finger
+        grasp = Action.grasp(*beside, yaw)
+        plan = primitives.plan(cfg.sim, cfg.heightmap, height, grasp)
+        return primitives.joint_trajectory(cfg.sim, plan)
+
     simulator, sinks = c_physics.CSimulator(world), []
     for number in range(24):
-        yaw = number * np.pi / 24
-        beside = 0.061 * np.float32([np.cos(yaw), np.sin(yaw)])  # to the middle of a finger
-        set_points = plan(height, Action.grasp(*beside, yaw))
-        joints = jax.device_get(primitives.joint_trajectory(cfg.sim, set_points))
+        joints = jax.device_get(joints_at(jnp.float32(number * np.pi / 24)))
         assert joints.reachable
         qpos = simulator.rollout(scene, fields, joints).qpos[cfg.sim.grasp_phases[0] - 1]
         sinks.append(2 * HALF - _tips(world, qpos))
@@ -148,10 +154,9 @@ def test_grip_holds_by_friction(friction: float, holds: bool):
     )
     cfg = _config(1, pad_friction=(0.03, 1.2), grip_force=(15.0, 40.0), grasp_phases=(60, 50, 80))
     world = model.build(cfg.scene, cfg.sim)
-    fields = jax.tree.map(np.asarray, model.scene_fields(world, scene))
+    fields = placed.fields_of(world, scene)
     height = np.full((cfg.heightmap.size,) * 2, 2 * half[2])
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, Action.grasp(0.0, 0.0, 0.0))
-    joints = jax.device_get(primitives.joint_trajectory(cfg.sim, plan))
+    joints = planned(cfg, height, Action.grasp(0.0, 0.0, 0.0))
     waiting = np.repeat(joints.control[-1:], 500, axis=0)  # 2 s
     held = joints.replace(control=np.concatenate([joints.control, waiting]))
     qpos = c_physics.CSimulator(world).rollout(scene, fields, held).qpos

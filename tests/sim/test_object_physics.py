@@ -18,6 +18,7 @@ from csac_jax.sim.c_physics import CPhysics
 from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
+from tests.world import placed
 
 pytestmark = pytest.mark.mjx  # ranks are promoted in `physics.healthy`
 SCENE = {"slots": ("object",) * 3, "min_blocks": 3, "objects": "procedural:0:42"}
@@ -75,12 +76,16 @@ def test_objects_need_a_library():
 
 def _grasp(env: Env, scene: SceneState) -> tuple:
     """The scene, its fields, and the joints of the planner's grasp; NumPy."""
-    state = jax.jit(env.reset_to)(scene)
-    height = state.obs.height
-    grasp = oracle.grasp(CONFIG, state.scene, height)
-    plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp)
-    fields = model.scene_fields(env.physics.world, scene)
-    return jax.device_get((scene, fields, primitives.joint_trajectory(CONFIG.sim, plan)))
+
+    @jax.jit
+    def planned(scene: SceneState) -> tuple:
+        height = env.reset_to(scene).obs.height
+        grasp = oracle.grasp(CONFIG, scene, height)
+        plan = primitives.plan(CONFIG.sim, CONFIG.heightmap, height, grasp)
+        fields = model.scene_fields(env.physics.world, scene)
+        return scene, fields, primitives.joint_trajectory(CONFIG.sim, plan)
+
+    return jax.device_get(planned(scene))
 
 
 def test_objects_at_rest_sleep_until_they_are_touched(env: Env):
@@ -108,7 +113,7 @@ def _slip(cfg: Config) -> float:
     """Distance, m, that a bar of 140 g slips down in the hand while it hangs there for a second."""
     world = model.build(cfg.scene, cfg.sim)
     scene, joints = grasped_bar(cfg)
-    fields = jax.device_get(model.scene_fields(world, scene))
+    fields = placed.fields_of(world, scene)
     qpos = c_physics.trajectory(world, fields, scene, joints).qpos
     hangs = qpos[:, world.block_qpos[0, 2]] - qpos[:, world.robot_qpos[2]]
     closed = sum(cfg.sim.grasp_phases[:2])

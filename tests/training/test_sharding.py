@@ -45,6 +45,7 @@ def test_eight_devices_are_one(tmp_path: Path):
     assert found["scenes"]["parts"] == [[2, 1], [2, 3]]
 
 
+@pytest.mark.slow
 def test_seeds_on_eight_devices_compile_without_shardy():
     """Claim: the learner's step compiles with a seed on each device by the partitioner before
     Shardy. It ended the process on a sort whose keys nobody read."""

@@ -354,7 +354,7 @@ def test_a_cleared_table_is_a_true_end(run):
     aside = jnp.asarray([[3.0 + 0.3 * i, 0.0, 1.0] for i in range(3)])
     position = scenes.scene.position.at[0].set(aside)
     placed = scenes.scene.replace(in_play=in_play, position=position)
-    empty = jax.vmap(lambda scene: Env.reset_to(run.program.env, scene))(placed)
+    empty = jax.jit(jax.vmap(lambda scene: Env.reset_to(run.program.env, scene)))(placed)
     state, metrics = run.chunk(copy(run.states[0].replace(scenes=empty)))
     assert metrics.terminated[0].tolist() == [True, False]
     assert state.replay.items.terminated[0]

@@ -65,7 +65,7 @@ def reference() -> Reference:
     )
     with mujoco_rays.nominal_meshes():
         world = model.build(SceneConfig(slots=slots, min_blocks=1), SimConfig(physics="c"))
-    polytopes = observe.polytopes(slots, jax.tree.map(jnp.asarray, scene))
+    polytopes = jax.jit(observe.polytopes, static_argnums=0)(slots, scene)
     return Reference(world, mujoco_rays.placed(world, scene).data, polytopes)
 
 

@@ -4,12 +4,12 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import mujoco
 import numpy as np
 import pytest
 
 from csac_jax.world import model as models, scene_state
+from tests.world.placed import fields_of
 
 
 class Placed(NamedTuple):
@@ -39,7 +39,7 @@ def nominal_meshes() -> Iterator[None]:
 def placed(world: models.World, scene: scene_state.SceneState) -> Placed:
     """A scene of a world that was built by `nominal_meshes`; hand high above, table endless."""
     with nominal_meshes():
-        fields = jax.device_get(models.scene_fields(world, scene))
+        fields = fields_of(world, scene)
     model = models.with_blocks(world, fields)
     model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = 0.0
     data = mujoco.MjData(model)

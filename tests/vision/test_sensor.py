@@ -172,7 +172,7 @@ def test_colours_are_dropped_for_whole_episodes(view):
     assert 0.2 < grey[0].mean() < 0.4
     np.testing.assert_allclose(states.obs.height, true.height, atol=1e-6)
     np.testing.assert_array_equal(states.obs.colour[~grey[0]], true.colour[~grey[0]])
-    every = _env(heightmap=view, sensor=SensorConfig(grey=1.0)).reset(jax.random.key(0))
+    every = jax.jit(_env(heightmap=view, sensor=SensorConfig(grey=1.0)).reset)(jax.random.key(0))
     assert (every.obs.colour == sensor.GREY).all()
 
 

@@ -9,6 +9,13 @@ from csac_jax.scenes import cases
 from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 
+_fields = jax.jit(model.scene_fields, static_argnums=0)
+
+
+def fields_of(world: model.World, scene: SceneState) -> model.BlockFields:
+    """Computes the fields of a scene's blocks, compiled once for a world."""
+    return jax.device_get(_fields(world, scene))
+
 
 def in_c(
     world: model.World,
@@ -17,7 +24,7 @@ def in_c(
     iterations: int = 50,
 ) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Builds one scene and its contacts; the hand high above, parked blocks weightless."""
-    fields = fields or jax.device_get(model.scene_fields(world, scene))
+    fields = fields or fields_of(world, scene)
     exact = model.with_blocks(world, fields)
     exact.opt.iterations, exact.opt.ls_iterations = iterations, iterations
     exact.body_gravcomp[world.block_bodies[~scene.in_play]] = 1.0

@@ -5,7 +5,6 @@ import re
 import shutil
 from pathlib import Path
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -55,7 +54,7 @@ def _compiled(monkeypatch: pytest.MonkeyPatch, scene: SceneState, scale: float) 
 
 
 def _fields(world: model.World, scene: SceneState) -> model.BlockFields:
-    return jax.device_get(model.scene_fields(world, scene))
+    return placed.fields_of(world, scene)
 
 
 def test_mjcf_text_is_the_world(world: model.World):

@@ -12,7 +12,7 @@ from csac_jax import presets
 from csac_jax.agent import maps
 from csac_jax.config import TRAY_WALL, Config, SceneConfig
 from csac_jax.constants import Primitive
-from csac_jax.env import Env
+from csac_jax.env import Env, State
 from csac_jax.nets import networks
 from csac_jax.robot.primitives import Action
 from csac_jax.scenes import pool
@@ -66,6 +66,10 @@ def test_walls_are_those_of_the_model():
         assert (meets | (exact.geom_contype[ids] & exact.geom_conaffinity[geom])).all()
 
 
+def _after(env: Env, scene: scene_state.SceneState, action: Action) -> State:
+    return jax.jit(lambda scene, action: env.step(env.reset_to(scene), action))(scene, action)
+
+
 def test_walls_hold_a_block():
     """Claim: a block that is pushed at a wall stops there; without walls it goes on, and beyond the
     walls it counts as lost."""
@@ -76,14 +80,14 @@ def test_walls_hold_a_block():
         cfg = CFG.change(scene={"tray": side})
         world = model.build(cfg.scene, cfg.sim)
         env = Env(cfg, simulation.make(world, cfg.sim), scene)
-        state = jax.jit(env.step)(env.reset_to(scene), push)
+        state = _after(env, scene, push)
         ends[side] = float(state.scene.position[0, 0]), int(state.info.blocks_lost)
     assert 0.5 * SIDE - 0.03 < ends[SIDE][0] < 0.5 * SIDE - 0.0235
     assert ends[SIDE][1] == 0
     assert ends[0.0][0] > 0.5 * SIDE - 0.0205
     env = Env(CFG, simulation.make(_world(), CFG.sim), scene)
     beyond = _scene(0.5 * SIDE + 0.05, 0.0)
-    state = jax.jit(env.step)(env.reset_to(beyond), Action.grasp(0.0, 0.0, 0.0))
+    state = _after(env, beyond, Action.grasp(0.0, 0.0, 0.0))
     assert int(state.info.blocks_lost) == 1
 
 
@@ -94,7 +98,7 @@ def test_walls_are_seen(view: str):
     with mujoco_rays.nominal_meshes():
         world = model.build(cfg.scene, cfg.sim)
     exact, data = mujoco_rays.placed(world, scene)
-    seen = jax.device_get(observe.observe(cfg, jax.tree.map(jnp.asarray, scene)))
+    seen = jax.device_get(jax.jit(lambda scene: observe.observe(cfg, scene))(scene))
     place = (np.arange(128) - 63.5) * cfg.heightmap.cell
     x, y = (axis.ravel() for axis in np.meshgrid(place, place))
     origins = np.stack([x, y, np.full_like(x, 0.4)], axis=1)
@@ -120,9 +124,12 @@ def test_bare_walls_are_no_places_to_act(view: str):
     cfg = CFG.change(heightmap={"size": 64, "view": view})
     frames = maps.frames(cfg, networks.make(cfg.net))
 
+    @jax.jit
+    def actionable(scene: scene_state.SceneState) -> jax.Array:
+        return maps.actionable_cells(frames, observe.observe(cfg, scene))
+
     def cells(scene: scene_state.SceneState) -> np.ndarray:
-        obs = observe.observe(cfg, jax.tree.map(jnp.asarray, scene))
-        return np.asarray(maps.actionable_cells(frames, obs))
+        return np.asarray(actionable(scene))
 
     empty = scene_state.parked(SCENE.slots)
     assert not cells(empty)[Primitive.GRASP].any()
@@ -148,7 +155,7 @@ def test_scenes_settle_inside_the_tray(tmp_path, monkeypatch: pytest.MonkeyPatch
     env = Env(cfg, simulation.make(_world(), cfg.sim), scenes)
     first = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), scenes)
     keys = jax.random.split(jax.random.key(0), 16)
-    turned = jax.device_get(jax.vmap(env.randomise_pose, (0, None))(keys, first))
+    turned = jax.device_get(jax.jit(jax.vmap(env.randomise_pose, (0, None)))(keys, first))
     xy = turned.position[:, first.in_play, :2].reshape(-1, 2)
     place = np.asarray(first.position[first.in_play, :2])
     np.testing.assert_allclose(
