@@ -282,11 +282,14 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-    candidates: ClassVar[int] = 64  # J, actions sampled in a round (QT-Opt)
-    elites: ClassVar[int] = 6  # K, best actions that the next round is fitted to (QT-Opt)
-    rounds: ClassVar[int] = 3  # of sampling and fitting (ours; QT-Opt: 2)
+    candidates: int = number(64, 1, 2**16)  # J, actions sampled in a round.
+    elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
+    rounds: int = number(3, 1, 1000)  # Rounds of sampling and fitting.
     start: Literal["both", "actor", "cells"] = "both"
     """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
+
+    def check(self) -> None:
+        require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
 
 
 class PolicyConfig(Section, section="policy"):

@@ -45,7 +45,7 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
         ("scene.density", [(50.0, 900.0), (900.0, 450.0), (450.0, 4000.0)]),
         ("scene.friction", [(0.05, 1.0), (1.0, 0.5), (0.5, 2.5)]),
         ("scene.drop_extent", [(0.04, 0.2), (0.2, 0.1), (0.2, 0.5)]),
-        ("cem.start", ["somewhere"]),
+        *(("cem.elites", [65, 1]), ("cem.start", ["somewhere"])),
         *(("policy.place", ["best"]), ("policy.primitive", ["push"])),
         *(("target.value", ["mean"]), ("reward.push_label", ["depth"])),
         *(("reward.lost_block_penalty", [-1.0]), ("learn.loss", ["mse"])),

@@ -25,7 +25,7 @@ SETTINGS: dict[str, str | None] = {
 }
 """Settings by their dotted names; None: the setting is gone, whatever its value."""
 
-FIXED = {"net": {"pad_fraction", "upsample"}, "cem": {"candidates", "elites", "rounds"}}
+FIXED = {"net": {"pad_fraction", "upsample"}}
 """Former settings of each section, which must have the value of today's constant."""
 
 VALUES: dict[str, dict[str, str]] = {

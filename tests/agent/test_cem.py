@@ -37,10 +37,7 @@ def search(cfg: CEMConfig, score: cem.Score, mean, start=NO_START, seed: int = 0
 )
 def test_yaw_is_searched_across_the_seam(mean_yaw, peak_yaw):
     """Claim: a peak on the other side of yaw = +-1 is as near as it looks on the circle."""
-    cfg, score = (
-        with_constants(CEMConfig(), rounds=4, std=0.15),
-        one_peak([0.1, -0.2, peak_yaw], 0.2),
-    )
+    cfg, score = with_constants(CEMConfig(rounds=4), std=0.15), one_peak([0.1, -0.2, peak_yaw], 0.2)
     assert np.mean(search(cfg, score, [0.1, -0.2, mean_yaw], num=100).value > 0.98) >= 0.98
 
 
@@ -49,7 +46,7 @@ def test_more_rounds_come_nearer():
     peak = [0.35, -0.35, 0.2]
 
     def median_miss(rounds):
-        cfg = with_constants(CEMConfig(), rounds=rounds, std=0.2)
+        cfg = with_constants(CEMConfig(rounds=rounds), std=0.2)
         action = search(cfg, one_peak(peak, 1.0), jnp.zeros(3), num=100).action
         return np.median(np.linalg.norm(action - np.array([peak]), axis=-1))
 
@@ -63,7 +60,7 @@ def test_best_sample_is_kept():
     def score(action):
         return jnp.where(jnp.max(jnp.abs(action - needle)) < 1e-6, 1.0, -jnp.sum(action**2))
 
-    result = search(with_constants(CEMConfig(), rounds=4), score, jnp.zeros(3), needle[None])
+    result = search(CEMConfig(rounds=4), score, jnp.zeros(3), needle[None])
     assert_allclose(result.action[0], needle, atol=1e-6)
     assert result.value[0] == 1.0
 
@@ -79,7 +76,7 @@ def test_scores_that_are_not_numbers():
     """Claim: samples whose score is NaN are neither returned nor fitted to; if all are, the action
     is the proposal, in the box, and the value -inf."""
     half = lambda action: jnp.where(action[0] > 0.0, jnp.nan, -jnp.abs(action[0] + 0.5))  # noqa: E731
-    result = search(with_constants(CEMConfig(), rounds=4), half, jnp.full(3, 0.2))
+    result = search(CEMConfig(rounds=4), half, jnp.full(3, 0.2))
     assert_allclose(result.action[0, 0], -0.5, atol=0.02)
     result = search(CEMConfig(), lambda action: jnp.nan * action[0], [0.2, 2.0, 1.25])
     assert_allclose(result.action[0], [0.2, 1.0, -0.75], atol=1e-6)
@@ -89,9 +86,15 @@ def test_scores_that_are_not_numbers():
 def test_search_goes_on_where_no_score_was_found():
     """Claim: a round without any value leaves mean and std as they are."""
     score = lambda action: jnp.where(jnp.max(jnp.abs(action - 0.25)) < 0.06, 1.0, -jnp.inf)  # noqa: E731
-    cfg = with_constants(CEMConfig(), rounds=40)
-    result = search(cfg, score, jnp.zeros(3), num=50)  # P(hit) = 0.0014 a sample
+    result = search(CEMConfig(rounds=40), score, jnp.zeros(3), num=50)  # P(hit) = 0.0014 a sample
     assert np.mean(result.value == 1.0) > 0.8
+
+
+def test_start_must_fit():
+    """Claim: more starting points than candidates is an error that names the setting."""
+    cfg, key = CEMConfig(candidates=8), jax.random.key(0)
+    with pytest.raises(ValueError, match=r"cem\.candidates"):
+        cem.maximise(key, cfg, jnp.sum, jnp.zeros(3), jnp.zeros((9, 3)))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
 from csac_jax.runtime import compiler
-from tests.sections import with_constants
 
 KEYS = 20
 
@@ -207,7 +206,7 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
 def test_candidates_are_those_of_the_search(cfg, frames, parts):
     """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
     key; VPG's only candidate is the best pixel."""
-    one = parts(cfg.change(cem=with_constants(CEMConfig(start="actor"), rounds=1)))
+    one = parts(cfg.change(cem={"rounds": 1, "start": "actor"}))
     vpg, state, key = parts(algorithms.configure(cfg, "vpg")), _state(frames, 0), jax.random.key(3)
     for own, num in ((one, cfg.cem.candidates), (vpg, 1)):
         tried = jax.jit(lambda key, own=own: policy.candidates(key, own, state))(key)

@@ -323,7 +323,7 @@ def test_short_help(capsys: pytest.CaptureFixture, arguments: str):
     names = [field.name.replace("_", "-") for field in dataclasses.fields(options)]
     assert all(f"--{name}" in shown for name in (*names, "train.actions"))
     assert all(name in shown for name in presets.PRESETS)
-    assert "--cem.start" not in shown
+    assert "--cem.rounds" not in shown
 
 
 def test_examples_of_the_help_are_read(run_dir: Path, config_file: Path):

@@ -58,7 +58,7 @@ def test_missing_and_gone_settings():
     from before trays and the limit of the force; one with a setting that is gone without it; JSON's
     1 is 1.0 where a float is wanted."""
     values = _through_text(presets.quick())
-    del values["cem"]["start"], values["camera"], values["scene"]["tray"]
+    del values["cem"]["rounds"], values["camera"], values["scene"]["tray"]
     for name in ("opening", "down_force", "approach", "pad_friction", "grip_force"):
         del values["sim"][name]
     values["target"]["samples"] = 8
@@ -99,9 +99,6 @@ def test_former_settings_have_their_constants():
     number = {"format": configs.FORMAT}
     wanted = Config().change(net={"stride": 4})
     assert configs.from_dict(number | stored) == wanted
-    assert configs.from_dict(number | {"cem": {"candidates": 64, "rounds": 3}}) == Config()
-    with pytest.raises(SettingsError, match=r"^cem\.rounds: must be 3, not 2$"):
-        configs.from_dict(number | {"cem": {"rounds": 2}})
     assert configs.from_dict(number | dense).net == DenseNet121()
     for field, value, message in (
         ("margin", 0.5, r"net\.pad_fraction: must be 0\.125, not 0\.5"),

@@ -151,6 +151,7 @@ def test_other_files_are_refused(tmp_path: Path, params: Params, change: Callabl
         {"heightmap": {"size": 2**31}},
         {"heightmap": {"size": 1024}, "net": {"rotations": 360}},
         {"net": {"head": 2**31}},
+        {"cem": {"candidates": 2**31}},
     ],
 )
 @pytest.mark.filterwarnings("ignore")
