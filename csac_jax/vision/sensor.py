@@ -15,7 +15,7 @@ from csac_jax.vision import camera, depth_camera
 from csac_jax.vision.camera import Camera
 
 GREY = 0.5  # level of a view without colours (ours), which the small net takes as 0
-_OWN, _SIDE = np.uint32([2**31, 2**31 + 1])  # distinct from a key's children by `split`
+_OWN, _SIDE = np.uint32(2**31), np.uint32(2**31 + 1)  # distinct from children by `split`
 _SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
 
