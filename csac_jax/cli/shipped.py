@@ -19,6 +19,7 @@ MEASURED = {
     "shipped": Measured("random10", 99.1, 99.8),
     "shipped_camera": Measured("camera, noise", 98.6, 98.0),
     "shipped_clutter": Measured("random30", 97.0, 83.0),
+    "shipped_general": Measured("pile", 97.7, 98.0),
     "shipped_grippers": Measured("random10, 2f85", 97.7, 99.0),
     "shipped_objects": Measured("pile", 97.6, 98.1),
     "shipped_target": Measured("target_objects", 90.7, 99.0),

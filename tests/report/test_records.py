@@ -124,7 +124,7 @@ def test_records_that_pages_name_exist():
     families = [path for path in ARCHIVES if path.parent == index.RESULTS]
     runs = [name for path in families for name in index.contents(path)]
     named = re.findall(
-        r"`((?:fast|grippers|objects|paper|quick)/[\w*/-]+)`", re.sub(pattern, "", text)
+        r"`((?:fast|general|grippers|objects|paper|quick)/[\w*/-]+)`", re.sub(pattern, "", text)
     )
     assert len(named) > 20
     assert not [name for name in named if not fnmatch.filter(runs, f"{name}*")]
