@@ -101,7 +101,8 @@ class Simulator:
 
 
 PEER = Peer(Simulator, Grasp, Pose, "")
-NOTES = {"clearance": ", tips 4 mm low", **dict.fromkeys(("oblique", "obliquefit"), ", oblique")}
+ASIDE = ("oblique", "obliquefit", "generaloblique")
+NOTES = {"clearance": ", tips 4 mm low", **dict.fromkeys(ASIDE, ", oblique")}
 HAND = {"gripper": "franka_hand", "opening": "full"}
 
 
