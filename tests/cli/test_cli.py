@@ -75,7 +75,10 @@ def run_dir(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("trian quick", "'trian'; did you mean train? choose one of: train, sweep, eval, play"),
+        (
+            "trian quick",
+            "'trian'; did you mean train? choose one of: demo, train, sweep, eval, play",
+        ),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
         ("train smoke --eval-suite cases", "--eval-suite: give it with --eval-every N"),
         ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
@@ -674,5 +677,6 @@ def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str,
         yield from ()
 
     monkeypatch.setattr(rollout, "episode", episode)
+    monkeypatch.setattr("csac_jax.render.episode.summary", lambda *_: "")
     play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE), {})
     assert turned == [any_yaw]

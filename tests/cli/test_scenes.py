@@ -13,7 +13,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.scenes import certify
 from csac_jax.scenes.certify import Certificate
 
-COMMAND = ["scenes", "certify", "grid", "--count", "6", "--jobs", "1", "--out"]
+COMMAND = ["scenes", "certify", "bars", "--count", "6", "--jobs", "1", "--out"]
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_changed_byte_is_refused(tmp_path: Path, judged: list[int], name: str):
     changed = arrays[name].reshape(-1).view(np.uint8)
     changed[-4 if name == "settings" else 0] ^= 1
     np.savez(path, **arrays)
-    with pytest.raises(SettingsError, match=r"some\.npz: scene grid 0: .*digest") as error:
+    with pytest.raises(SettingsError, match=r"some\.npz: scene bars 0: .*digest") as error:
         certify.load(path)
     assert "\n" not in str(error.value)
 
@@ -97,14 +97,14 @@ def test_case_files_are_candidates(tmp_path: Path, judged: list[int]):
 
 
 REFUSED = {
-    "certif grid": "certif",
+    "certif bars": "certif",
     "certify --out x.npz": "sources",
-    "certify grid": "--out",
+    "certify bars": "--out",
     "certify nowhere --out x.npz": "'nowhere' is neither a folder",
-    "certify grid --out x.txt": "--out: x.txt must end in .npz",
-    "certify grid --out x.npz --count 0": "--count",
-    "certify grid --out x.npz --seed -1": "--seed",
-    "certify grid --out x.npz --physics mjx": "--physics",
+    "certify bars --out x.txt": "--out: x.txt must end in .npz",
+    "certify bars --out x.npz --count 0": "--count",
+    "certify bars --out x.npz --seed -1": "--seed",
+    "certify bars --out x.npz --physics mjx": "--physics",
     "certify . --out x.npz": "holds no case file",
 }
 
