@@ -83,7 +83,8 @@ def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: s
 def test_settings_reach_their_configs():
     """Claim: each setting is the preset with its algorithm, the flags for all, and its own values,
     which win."""
-    flags = "--seeds 3 --seed 7 --sim.physics c --learn.batch 4 --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
+    flags = "--seeds 3 --seed 7 --sim.physics c --learn.batch 4"
+    flags += " --vary algo=csac,vpg --vary target.gamma=0.1,0.3"
     options, plan = command.read(["smoke", *flags.split()])
     assert (options.seeds, plan.seeds, options.devices, options.shard) == (3, 3, None, "seeds")
     same = {"seed": 7, "sim": {"physics": "c"}, "learn": {"batch": 4}}
