@@ -66,6 +66,8 @@ def measure(name: str, out: Path, share: float) -> int:
         fits = [s for s in names if kind != "learned" or suites.SUITES[s].target == asks_target]
         command = ["eval", source, "--policy", kind, "--physics", "c", "--share", str(share)]
         command += ["--out", str(out / name), "--suites", *fits]
+        if name == "shipped_grippers":
+            command += ["--sim.gripper", "varied"]
         if has_objects:
             command += ["--objects", OBJECTS, "--sim.clearance", CLEARANCE]
         if fits and (code := cli.main(command)):

@@ -59,7 +59,8 @@ class Monitor(Callback):
         Args: make_policy, of a learner's state; callbacks, whose `evaluated` is called; log, takes
         a line about each evaluation.
         """
-        self._suite = suites.prepare(cfg, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
+        world = suites.standard(cfg, plan.suite)
+        self._suite = suites.prepare(world, plan.suite, plan.episodes, SEED, robot=cfg.sim.robot)
         self._cfg, self._plan, self._policy = cfg, plan, make_policy
         self._callbacks, self._log = callbacks, log
         self._best: Score = ()

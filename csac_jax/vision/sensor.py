@@ -27,7 +27,9 @@ def episode_key(key: jax.Array | None, cfg: Config) -> jax.Array | None:
     if not cfg.sensor.active and cfg.heightmap.view != "both":
         return None
     if key is None:
-        raise ValueError("a reset with sensor noise (config section `sensor`) needs a key")
+        raise ValueError(
+            "a reset with sensor noise (config section `sensor`), or with both views, needs a key"
+        )
     return jax.random.fold_in(key, _OWN)
 
 
