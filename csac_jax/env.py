@@ -25,7 +25,7 @@ from csac_jax.robot.primitives import Action
 from csac_jax.runtime import short
 from csac_jax.scenes import pool
 from csac_jax.sim import backend, outcome, physics as simulation
-from csac_jax.sim.physics import Motion, Physics
+from csac_jax.sim.physics import Motion, Physics, Started
 from csac_jax.vision import heightmap, observe, sensor
 from csac_jax.vision.heightmap import VIEW_HEIGHT, Observation
 from csac_jax.world import model, scene_state
@@ -169,6 +169,17 @@ class Env:
         height = state.obs.height
         motion = simulation.act(self.physics, self.cfg, before, height, action, valid)
         return self._judge(state, action, motion)
+
+    def start(self, state: State, action: Action) -> Started:
+        """Starts an action, which Warp runs in the background until `finish`."""
+        before, valid = self._validate(state)
+        return simulation.start(self.physics, self.cfg, before, state.obs.height, action, valid)
+
+    def finish(self, state: State, started: Started, after: jax.Array) -> State:
+        """Returns the state after an action that was started, as `step`. Physics may run until
+        `after` [] was computed."""
+        motion = simulation.finish(self.physics, self.cfg, started, after)
+        return self._judge(state, started.action, motion)
 
     def _validate(self, state: State) -> tuple[SceneState, jax.Array]:
         """Returns the scene, empty if it or the observation is out of bounds, and [] bool."""

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -69,17 +69,48 @@ def prepare(physics: Physics, scenes: int) -> None:
         physics.simulator.prepared(scenes)
 
 
+class Started(NamedTuple):
+    """A primitive that physics runs, between `start` and `finish`."""
+
+    scene: SceneState
+    action: Action
+    plan: Plan
+    reachable: jax.Array  # [] bool, the robot can follow
+    valid: jax.Array | bool  # [] bool, see `act`
+    running: Any  # what `finish` gets the result from: of Warp a token, else the result
+
+
+def start(
+    physics: Physics,
+    cfg: Config,
+    scene: SceneState,
+    height: jax.Array,
+    action: Action,
+    valid: jax.Array | bool = True,
+) -> Started:
+    """Starts a primitive over the map `height` [H, W] m, see `act`. Warp runs it in the background:
+    `finish` it before another of as many scenes starts."""
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
+    joints = primitives.joint_trajectory(cfg.sim, plan)
+    begin = physics.start if isinstance(physics, warp_physics.WarpPhysics) else physics.run
+    return Started(scene, action, plan, joints.reachable, valid, begin(scene, joints))
+
+
+def finish(physics: Physics, cfg: Config, started: Started, after: jax.Array) -> Motion:
+    """Waits for a primitive; Warp runs until `after` [] was computed."""
+    result = started.running
+    if isinstance(physics, warp_physics.WarpPhysics):
+        result = physics.finish(started.scene, result, after)
+    return _judged(cfg, started, *result)
+
+
 def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
     """Runs a primitive over the map `height` [H, W] m; nothing moves if the robot cannot follow."""
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
-    after, trace = physics.run(scene, joints)
-    unmoved = scene_state.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
-    choose = functools.partial(jnp.where, joints.reachable)
-    after, trace = jax.tree.map(choose, (after, trace), unmoved)
-    return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
+    return _followed(scene, plan, joints.reachable, *physics.run(scene, joints))
 
 
 def act(
@@ -92,7 +123,26 @@ def act(
 ) -> Motion:
     """Runs a primitive, as `execute`, and takes lifted and lost blocks off the table. Undoes one
     that is not `valid` [] bool, that diverges or that is blocked."""
-    after, trace, plan = execute(physics, cfg, scene, height, action)
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
+    joints = primitives.joint_trajectory(cfg.sim, plan)
+    started = Started(scene, action, plan, joints.reachable, valid, None)
+    return _judged(cfg, started, *physics.run(scene, joints))
+
+
+def _followed(
+    scene: SceneState, plan: Plan, reachable: jax.Array, after: SceneState, trace: Trace
+) -> tuple[SceneState, Trace, Plan]:
+    """Returns the scene as it was where the robot cannot follow."""
+    unmoved = scene_state.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
+    choose = functools.partial(jnp.where, reachable)
+    after, trace = jax.tree.map(choose, (after, trace), unmoved)
+    return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
+
+
+def _judged(cfg: Config, started: Started, after: SceneState, trace: Trace) -> Motion:
+    """Takes lifted and lost blocks off the table, undoes what `act` says."""
+    scene, action, plan, reachable, valid, _ = started
+    after, trace, plan = _followed(scene, plan, reachable, after, trace)
     finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
     diverged = ~(valid & finite & healthy(after))
     guarded = cfg.sim.approach == "guarded"

@@ -57,6 +57,7 @@ _TRACE = {  # leaves of `outcome.Trace`; gaps are positions of the finger's join
     "gap_end": wp.array[float],
     "contact_overflow": wp.array[float],  # of whole numbers, see `warp_physics`
 }
+_TOKEN, _AFTER = {"token": wp.array[float]}, {"after": wp.array[float]}
 
 _STOPPED_EARLY = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS  # by design
 _ONE_AT_A_TIME = threading.Lock()  # threads that prepare scenes: `warp_graph` patches Warp
@@ -223,13 +224,36 @@ class Batch:
             wp.zeros(_shape(name, scenes, slots), dtype=kind.dtype) for name, kind in _TRACE.items()
         ]
         self._advance = self.recorded(self.substep)
+        if wp.get_device().is_cuda:
+            self._stream = wp.Stream(priority=-1)  # before others: few blocks of threads each
+            self._given, self._moved = wp.Event(), wp.Event()
 
     def run(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
         """Runs one primitive; arrays in the order of a simulator's arguments and results."""
+        self._take(inputs)
+        self._advance()
+        self._give(outputs)
+
+    def start(self, inputs: Sequence[wp.array]) -> None:
+        """Starts one primitive on a stream of its own."""
+        self._take(inputs)
+        wp.record_event(self._given)
+        with wp.ScopedStream(self._stream, sync_enter=False):
+            wp.wait_event(self._given)
+            self._advance()
+            wp.record_event(self._moved)
+
+    def finish(self, outputs: Sequence[wp.array]) -> None:
+        """Makes the current stream wait for the primitive that was started last."""
+        wp.wait_event(self._moved)
+        self._give(outputs)
+
+    def _take(self, inputs: Sequence[wp.array]) -> None:
         for target, source in zip(self.given, inputs, strict=True):
             wp.copy(target, source)
         self.restart()
-        self._advance()
+
+    def _give(self, outputs: Sequence[wp.array]) -> None:
         results = [self.data.qpos, self.data.qvel, *self._trace]
         for target, result in zip(outputs, results, strict=True):
             wp.copy(target, result)
@@ -324,19 +348,33 @@ class WarpSimulator:
         self._world, self._cfg = world, cfg
         self.arguments = {**fields(world, cfg), **_STATE, **_COMMAND}
         self._results = {**_STATE, **_TRACE}
-        self._callable = wp.jax_callable(
-            _annotated(self._run, list(self.arguments.items()), list(self._results.items())),
-            num_outputs=len(self._results),
-            graph_mode=wp.JaxCallableGraphMode.NONE,  # `Batch` records, without buffers of XLA
-        )
+        self._run_call = _callable(self._run, self.arguments, self._results)
+        self._start_call = _callable(self._start, self.arguments, _TOKEN)
+        self._finish_call = _callable(self._finish, _TOKEN | _AFTER, self._results)
 
     def __call__(self, **arrays: jax.Array) -> dict[str, jax.Array]:
-        model, (scenes, slots) = self._world.model, arrays["in_play"].shape
+        given = [arrays[name] for name in self.arguments]
+        return self._named(self._run_call(*given, output_dims=self._dims(len(given[-1]))))
+
+    def start(self, **arrays: jax.Array) -> jax.Array:
+        """Starts the primitive on a stream of its own; returns its token [E], zeros."""
+        given = [arrays[name] for name in self.arguments]
+        (token,) = self._start_call(*given, output_dims={"token_out": (len(given[-1]),)})
+        return token
+
+    def finish(self, token: jax.Array, after: jax.Array) -> dict[str, jax.Array]:
+        """Waits for the primitive of a token [E] once `after` [E] was computed; its results."""
+        return self._named(self._finish_call(token, after, output_dims=self._dims(len(token))))
+
+    def _named(self, results: Sequence[jax.Array]) -> dict[str, jax.Array]:
+        return dict(zip(self._results, results, strict=True))
+
+    def _dims(self, scenes: int) -> dict[str, tuple[int, ...]]:
+        """Returns the results' shapes."""
+        model, slots = self._world.model, len(self._world.slots)
         shapes = {name: _shape(name, scenes, slots) for name in _TRACE}
         shapes |= {"qpos": (scenes, model.nq), "qvel": (scenes, model.nv)}
-        dims = {f"{name}_out": shape for name, shape in shapes.items()}
-        results = self._callable(*(arrays[name] for name in self.arguments), output_dims=dims)
-        return dict(zip(self._results, results, strict=True))
+        return {f"{name}_out": shape for name, shape in shapes.items()}
 
     def prepared(self, scenes: int) -> Batch:
         """Returns the batch of so many scenes on the current device; builds its kernels once."""
@@ -351,6 +389,26 @@ class WarpSimulator:
         count = len(self.arguments)
         with wp.ScopedDevice(arrays[0].device):
             self.prepared(arrays[0].shape[0]).run(arrays[:count], arrays[count:])
+
+    def _start(self, *arrays: wp.array) -> None:
+        *inputs, token = arrays
+        with wp.ScopedDevice(token.device):
+            self.prepared(token.shape[0]).start(inputs)
+            token.zero_()
+
+    def _finish(self, *arrays: wp.array) -> None:
+        token, _, *outputs = arrays
+        with wp.ScopedDevice(token.device):
+            self.prepared(token.shape[0]).finish(outputs)
+
+
+def _callable(run: Callable[..., None], arguments: dict[str, Any], results: dict[str, Any]) -> Any:
+    """Makes a function of JAX's arrays. `Batch` records graphs, without buffers of XLA."""
+    return wp.jax_callable(
+        _annotated(run, list(arguments.items()), list(results.items())),
+        num_outputs=len(results),
+        graph_mode=wp.JaxCallableGraphMode.NONE,
+    )
 
 
 def _annotated(

@@ -27,7 +27,8 @@ def repeated(step: Callable[[], None], times: int) -> Callable[[], None]:
     if not wp.get_device().is_cuda:
         return functools.partial(_repeat, step_in_place, times)
     recorded = max(n for n in range(1, LONGEST + 1) if times % n == 0)
-    with _no_garbage_collection(), wp.ScopedCapture() as capture:
+    own = wp.ScopedStream(wp.Stream())  # JAX's may be forgotten while it is recorded
+    with _no_garbage_collection(), own, wp.ScopedCapture() as capture:
         _repeat(step_in_place, recorded)
     return functools.partial(_launch, capture.graph, times // recorded, arrays)
 

@@ -35,19 +35,46 @@ class WarpPhysics:
     def _simulate(self) -> Callable[[dict[str, jax.Array]], dict[str, jax.Array]]:
         return _flat_vmap(lambda inputs: self.simulator(**inputs))
 
+    @functools.cached_property
+    def _start(self) -> Callable[[dict[str, jax.Array]], jax.Array]:
+        return _flat_vmap(lambda inputs: self.simulator.start(**inputs))
+
+    @functools.cached_property
+    def _finish(self) -> Callable[[tuple[jax.Array, jax.Array]], dict[str, jax.Array]]:
+        return _flat_vmap(lambda inputs: self.simulator.finish(*inputs))
+
     def run(self, scene: SceneState, joints: JointTrajectory) -> tuple[SceneState, Trace]:
         """Runs one primitive, see `physics.Physics`."""
-        world = self.world
-        scene = scene_state.park(scene, scene.in_play)  # where nothing meets them
-        arrays = inputs(self, scene, joints)
-        results = self._simulate(jax.tree.map(lambda leaf: leaf[None], arrays))
+        return self._result(scene, self._simulate(_batch(inputs(self, _parked(scene), joints))))
+
+    def start(self, scene: SceneState, joints: JointTrajectory) -> jax.Array:
+        """Starts one primitive on a stream of its own; returns a token [] for `finish`."""
+        return self._start(_batch(inputs(self, _parked(scene), joints)))[0]
+
+    def finish(
+        self, scene: SceneState, token: jax.Array, after: jax.Array
+    ) -> tuple[SceneState, Trace]:
+        """Waits for the primitive of a token [] once `after` [] was computed; results of `run`."""
+        return self._result(scene, self._finish(_batch((token, after))))
+
+    def _result(self, scene: SceneState, results: dict) -> tuple[SceneState, Trace]:
         results = jax.tree.map(lambda leaf: leaf[0], results)
         for name in ("gap_closed", "gap_end"):
-            results[name] = world.gripper.gap(results[name], jnp)
+            results[name] = self.world.gripper.gap(results[name], jnp)
         # XLA runs a call twice on a GPU if a scan stores one of its results unchanged.
         results["contact_overflow"] = results["contact_overflow"].astype(jnp.int32)
-        moved = model_fields.moved(world, scene, results.pop("qpos"), results.pop("qvel"))
-        return moved, Trace(**results)
+        state = results.pop("qpos"), results.pop("qvel")
+        return model_fields.moved(self.world, _parked(scene), *state), Trace(**results)
+
+
+def _parked(scene: SceneState) -> SceneState:
+    """Returns the scene with blocks out of play where nothing meets them."""
+    return scene_state.park(scene, scene.in_play)
+
+
+def _batch(tree: Any) -> Any:
+    """Returns leaves [1, ...] of a scene's [...]."""
+    return jax.tree.map(lambda leaf: leaf[None], tree)
 
 
 def make(world: World, cfg: SimConfig) -> WarpPhysics:

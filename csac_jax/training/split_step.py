@@ -20,7 +20,8 @@ from csac_jax.training.transitions import StepMetrics
 def compile_chunk(program: Program, num_steps: int, cached: bool = False) -> Any:
     """Returns a chunk as `programs.compile_chunk` does, or one that has `lower` alone; `cached`, a
     program without custom parts, is kept on disk, see `trace_cache`."""
-    if jax.default_backend() != "cpu" or program.mesh is not None:
+    whole = program.mesh is not None or program.cfg.train.overlap
+    if jax.default_backend() != "cpu" or whole:
         return programs.compile_chunk(program, num_steps)
     return _Split(program, num_steps, cached)
 

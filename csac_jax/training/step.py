@@ -1,6 +1,7 @@
 """The algorithm: one training step of all scenes, CSAC Algorithm 1. E = scenes, B = batch."""
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -16,6 +17,7 @@ from csac_jax.config import Config
 from csac_jax.replay import ring
 from csac_jax.replay.ring import ReplayState
 from csac_jax.replay.samplers import Sampler
+from csac_jax.robot.primitives import Action
 from csac_jax.training import sharding, transitions
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision import heightmap
@@ -46,6 +48,8 @@ class Program:
 def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
     """Takes one action in each of the E scenes and makes the updates that belong to it. On a CPU
     each half is a program of its own, see `split_step`; elsewhere both are one."""
+    if program.cfg.train.overlap:
+        return _overlapped(program, state)
     acted, metrics = act_half(program, state)
     # ---- acting ends, learning begins
     return learn_half(program, acted, metrics)
@@ -53,28 +57,9 @@ def train_step(program: Program, state: TrainState) -> tuple[TrainState, StepMet
 
 def act_half(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
     """Takes the actions of a step and stores them, lines 8-15; metrics without losses."""
-    cfg, env, learner, scenes = program.cfg, program.env, program.learner, state.scenes
-    key_act, _, key_reset = _step_keys(state.key, state.step)
-
-    # Observe and act (lines 8-13).
-    taken, idle = state.step * cfg.train.scenes, scenes.steps_without_change
-    action = learner.act(key_act, state.learner, scenes.obs, idle, taken)
-
-    # Simulate.
-    after = sharding.map_scenes(program.mesh, jax.vmap(env.step))(scenes, action)
-
-    # Replace finished scenes.
-    fresh = jax.vmap(env.auto_reset)(numbered_keys(key_reset, cfg.train.scenes), after)
-    scenes_next = transitions.where(after.done, fresh, after)
-
-    # Reward and remember (lines 14-15).
-    transition, push_better = transitions.remember(
-        cfg, learner, state.learner, scenes, action, after, scenes_next
-    )
-    replay = ring.add(state.replay, transition, ~after.info.physics_diverged)
-
-    metrics = transitions.action_metrics(cfg, scenes, transition, push_better, after)
-    return TrainState(state.key, state.step + 1, scenes_next, state.learner, replay), metrics
+    action = _choose(program, state)
+    after = sharding.map_scenes(program.mesh, jax.vmap(program.env.step))(state.scenes, action)
+    return _remember(program, state, action, after)
 
 
 def learn_half(
@@ -83,14 +68,71 @@ def learn_half(
     """Learns from the replay, lines 16-26, and adds the losses to the metrics of `act_half`."""
     cfg, step = program.cfg, state.step - 1
     _, key_learn, _ = _step_keys(state.key, step)
-    # Before `learning_starts` the result is dropped: a branch costs more.
     ready = state.step * cfg.train.scenes >= cfg.train.learning_starts
-    done = updates_done(cfg, step)
-    learned, priority, losses = learn(program, key_learn, state.learner, state.replay, done)
+    after, learned = _updated(program, key_learn, state, ready, updates_done(cfg, step))
+    return after, metrics._replace(**learned)
+
+
+def _overlapped(program: Program, state: TrainState) -> tuple[TrainState, StepMetrics]:
+    """Makes the updates while physics runs: they know the transitions before this action, which
+    the networks before them chose."""
+    cfg, env, step = program.cfg, program.env, state.step
+    action = _choose(program, state)
+    each = functools.partial(sharding.map_scenes, program.mesh)
+    started = each(jax.vmap(env.start))(state.scenes, action)
+
+    _, key_learn, _ = _step_keys(state.key, step)
+    ready = step * cfg.train.scenes >= cfg.train.learning_starts
+    key_learn = jax.random.fold_in(key_learn, _zero_after(started.running))
+    learned, losses = _updated(program, key_learn, state, ready, updates_done(cfg, step - 1))
+
+    done = jnp.broadcast_to(losses["critic_loss"] + losses["actor_loss"], (cfg.train.scenes,))
+    after = each(jax.vmap(env.finish))(state.scenes, started, done)
+    acted, metrics = _remember(program, learned, action, after)
+    return acted, metrics._replace(**losses)
+
+
+def _zero_after(tree: Any) -> jax.Array:
+    """Returns [] uint32, zero, that needs an array of `tree`."""
+    some = jax.tree.leaves(tree)[0].ravel()[0]
+    return jnp.where(some == some, 0, 1).astype(jnp.uint32)
+
+
+def _choose(program: Program, state: TrainState) -> Action:
+    """Chooses an action in each scene, lines 8-13."""
+    key_act, _, _ = _step_keys(state.key, state.step)
+    taken, scenes = state.step * program.cfg.train.scenes, state.scenes
+    idle = scenes.steps_without_change
+    return program.learner.act(key_act, state.learner, scenes.obs, idle, taken)
+
+
+def _remember(
+    program: Program, state: TrainState, action: Action, after: environment.State
+) -> tuple[TrainState, StepMetrics]:
+    """Replaces finished scenes; rewards and stores what happened, lines 14-15."""
+    cfg, env, scenes, learner = program.cfg, program.env, state.scenes, program.learner
+    _, _, key_reset = _step_keys(state.key, state.step)
+    fresh = jax.vmap(env.auto_reset)(numbered_keys(key_reset, cfg.train.scenes), after)
+    scenes_next = transitions.where(after.done, fresh, after)
+    transition, push_better = transitions.remember(
+        cfg, learner, state.learner, scenes, action, after, scenes_next
+    )
+    replay = ring.add(state.replay, transition, ~after.info.physics_diverged)
+    metrics = transitions.action_metrics(cfg, scenes, transition, push_better, after)
+    return TrainState(state.key, state.step + 1, scenes_next, state.learner, replay), metrics
+
+
+def _updated(
+    program: Program, key: jax.Array, state: TrainState, ready: jax.Array, done: jax.Array
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Makes the updates of a step, after `done` [] of the run, if it is `ready` []; returns also
+    what metrics say of them."""
+    # Before `learning_starts` the result is dropped: a branch costs more.
+    learned, priority, losses = learn(program, key, state.learner, state.replay, done)
     learned = jax.tree.map(lambda new, old: jnp.where(ready, new, old), learned, state.learner)
     priority = jnp.where(ready, priority, state.replay.priority)
     after = state.replace(learner=learned, replay=state.replay.replace(priority=priority))
-    return after, metrics._replace(learned=ready, finite=_is_finite(learned), **losses)
+    return after, {"learned": ready, "finite": _is_finite(learned), **losses}
 
 
 def learn(
