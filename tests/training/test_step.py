@@ -17,7 +17,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.agent import actor, actor_critic, rewards, values
 from csac_jax.agent.csac import CSAC
-from csac_jax.agent.learner import UpdateInfo
+from csac_jax.agent.learner import Learner, UpdateInfo
 from csac_jax.config import Config, PrioritisedReplay
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env
@@ -181,15 +181,55 @@ def test_what_acts_is_there_first(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
-    """Claim: only on a CPU, and on one device, is a chunk two programs."""
+    """Claim: only on a CPU, on one device and without overlap, is a chunk two
+    programs."""
 
     def is_split(program: Program) -> bool:
         return isinstance(split_step.compile_chunk(program, T), split_step._Split)
 
     assert is_split(run.program)
     assert not is_split(dataclasses.replace(run.program, mesh=mock.Mock()))
+    overlapped = CFG.change(train={"overlap": True})
+    assert not is_split(dataclasses.replace(run.program, cfg=overlapped))
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not is_split(run.program)
+
+
+class Pusher(Learner):
+    """Pushes at random places, and learns nothing."""
+
+    def init(self, key: jax.Array) -> Any:
+        return jnp.zeros(())
+
+    def act(self, key: jax.Array, state: Any, obs: Observation, *_: Any) -> Action:
+        pose = jax.random.uniform(key, (len(obs.height), 3), minval=-0.1, maxval=0.1)
+        return jax.vmap(Action.push)(*pose.T)
+
+    def update(self, key: jax.Array, state: Any, batch: Any, weights: jax.Array) -> Any:
+        raise NotImplementedError
+
+
+def test_overlap_learns_from_what_was_before(monkeypatch: pytest.MonkeyPatch):
+    """Claim: with overlap a step acts as without, and learns from the transitions before it."""
+
+    def learn(_: Program, __: jax.Array, learner: Any, replay: Any, ___: jax.Array) -> Any:
+        zero = jnp.zeros(())
+        names = ("critic_loss", "actor_loss", "td_error")
+        return learner, replay.priority, dict.fromkeys(names, zero) | {"q_mean": replay.size * 1.0}
+
+    monkeypatch.setattr(step, "learn", learn)
+    ends, seen = [], []
+    for overlap in (False, True):
+        train = {"overlap": overlap, "learning_starts": 1}
+        cfg = CFG.change(sim={"physics": "c"}, learn={"batch": 1}, train=train)
+        program = programs.make(cfg, learner=Pusher())
+        run = jax.jit(functools.partial(programs.run_steps, program, 3))
+        state, metrics = run(programs.init(program))
+        ends.append(state)
+        seen.append(metrics)
+    assert_same(ends[0], ends[1])
+    np.testing.assert_array_equal([one.q_mean for one in seen], [[2, 4, 6], [0, 2, 4]])
+    np.testing.assert_array_equal([one.learned for one in seen], [[1, 1, 1], [0, 1, 1]])
 
 
 def test_chunk_does_not_speak_to_the_host(run):
