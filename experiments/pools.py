@@ -13,7 +13,7 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.scenes import pool
 
-PRESETS = ("quick",)
+PRESETS = ("quick", "fast")
 
 
 def main() -> None:
@@ -23,8 +23,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_CACHE_HOME"] = folder
         for name in PRESETS:
-            cfg = presets.get(name)
-            pool.settled(cfg, pool.TRAIN_STREAM, cfg.scene.pool)
+            pool.scenes(presets.get(name), pool.TRAIN_STREAM)
         for path in Path(folder, "csac_jax", "pools").glob("*.npz"):
             with np.load(path) as settled:
                 np.savez_compressed(pool.shipped() / path.name, **settled)

@@ -257,13 +257,15 @@ def test_poured_blocks_that_leave_are_dropped_anew():
 
 
 def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the scenes that `quick` trains in come with the package, and settling gives the same;
+    """Claim: the scenes that `quick` and `fast` train in are shipped, and settling gives the same;
     of another processor, whose last bits differ, nearly all are alike to 2 mm. Where this fails,
     run `python -m experiments.pools`."""
     monkeypatch.setattr(pool, "_ROUND", 24)
     cfg = presets.quick()
     settled = pool.settled(cfg, pool.TRAIN_STREAM, 20)  # the first of those 1,024
     monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    monkeypatch.setattr(pool.arrange, "arrangements", None)
+    assert len(pool.scenes(presets.fast(), pool.TRAIN_STREAM).position) == 4096
     shipped = pool.scenes(cfg, pool.TRAIN_STREAM)
     assert len(shipped.position) == cfg.scene.pool
     fits = np.abs(settled.position - shipped.position[:20]).max(axis=(1, 2)) < 0.002
