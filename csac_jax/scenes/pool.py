@@ -1,8 +1,8 @@
 """The scenes that an environment draws from: packed arrangements, and blocks that were dropped.
 
 C MuJoCo settles dropped blocks on all cores, bit-identical for any number of threads. Scenes are
-cached on disk; those of the presets `quick` and `fast` come with the package. `stream` numbers the stream of
-random numbers.
+cached on disk; those of the presets `quick` and `fast` come with the package. `stream` numbers the
+stream of random numbers.
 """
 
 import contextlib
