@@ -29,6 +29,7 @@ ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 ROBOT, OBJECTS, GRIPPERS = (DOCS / name for name in ("robot.md", "objects.md", "grippers.md"))
 EXTEND = DOCS / "how-to" / "extend.md"
+MINE = DOCS / "how-to" / "my-robot.md"
 COMPARE = DOCS / "how-to" / "compare-my-part.md"
 AGENTS, LEARNER = ROOT / "AGENTS.md", DOCS / "how-to" / "own-jax-learner.md"
 ROOTS = [README, AGENTS, ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"]
@@ -201,13 +202,23 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
 
 
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the commands and Python blocks of docs/robot.md run in their order, but those that
-    need hardware, which are marked `py`."""
+    """Claim: the commands and Python blocks of docs/robot.md run in their order."""
     for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
     assert _run_page(ROBOT.read_text()) >= 6
     assert Path("demo/decision.png").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.mjx
+def test_my_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: the commands and the block of the page on one's own objects, hand and camera run in
+    their order, with two episodes; it ends in an arm's set-points."""
+    monkeypatch.chdir(tmp_path)
+    assert _run_page(re.sub(r"--episodes \d+", "--episodes 2", MINE.read_text())) == 9
+    for name in ("my_objects.png", "pile.png", "decision.png", "decision.json"):
+        assert Path(name).stat().st_size > 0
 
 
 @pytest.mark.slow
@@ -291,13 +302,13 @@ def test_compare_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.mjx
 @pytest.mark.optax
 def test_learner_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: PPO of the page has at most 75 lines, and trains two seeds in one program, which
+    """Claim: PPO of the page has at most 81 lines, and trains two seeds in one program, which
     differ; blocks per action are shares."""
     monkeypatch.chdir(tmp_path)
     small = presets.smoke().change(sim={"physics": "c"})
     monkeypatch.setattr(presets, "quick", lambda: small)
     learner, run = fenced(LEARNER, "python")
-    assert len(learner.splitlines()) <= 75
+    assert len(learner.splitlines()) <= 81
     namespace: dict[str, Any] = {"__name__": "page"}
     exec(compile(learner, "page", "exec"), namespace)
     with jax.debug_key_reuse(False):

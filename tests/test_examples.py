@@ -15,7 +15,13 @@ FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
 NOTEBOOK = FOLDER / "first_grasp.ipynb"
 TRAINERS = {"own_sampler", "own_network", "own_learner"}
 OTHERS = {"random_agent", "gym_policy_gradient", "optuna_search"}
-LONG = {"ros2_node", "ur_rtde", "camera_image"}  # see test_robot_examples and test_docs
+LONG = {
+    "ros2_node",
+    "ur_rtde",
+    "franka",
+    "realsense",
+    "camera_image",
+}  # see test_robot_examples and test_docs
 pytestmark = [pytest.mark.mjx, pytest.mark.optax]
 
 

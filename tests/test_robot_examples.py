@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,8 @@ import csac_jax
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
 UR = runpy.run_path(str(FOLDER / "ur_rtde.py"))
+FRANKA = runpy.run_path(str(FOLDER / "franka.py"))
+REALSENSE = runpy.run_path(str(FOLDER / "realsense.py"))
 ROS = runpy.run_path(str(FOLDER / "ros2_node.py"))
 ARGS = SimpleNamespace(speed=0.05, acceleration=0.2, force=15.0, reach=0.85, lowest=0.0)
 HEIGHTS = {"approach": 0.2, "descend": 0.1, "act": 0.1, "retreat": 0.2}
@@ -113,6 +116,118 @@ def test_dry_run_prints(tmp_path: Path, capsys: pytest.CaptureFixture):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     assert lines[1].startswith("+0.4000 +0.1000 +0.1000 ")
+
+
+class FakeFranka:
+    """Arm, hand and module of a Franka in one. The move `contact` fails as by a collision."""
+
+    ControlException = ArithmeticError
+    max_width = 0.08
+
+    def __init__(self, contact: int | None = None, yaw: float = 0.0) -> None:
+        self.log: list[Any] = []
+        self.width, self._contact, self._pose = 0.0, contact, np.eye(4)
+        self._pose[:3, :3] = Rotation.from_euler("xz", [np.pi, yaw]).as_matrix()
+
+    @property
+    def current_pose(self) -> Any:
+        return SimpleNamespace(end_effector_pose=SimpleNamespace(matrix=self._pose))
+
+    def Affine(self, pose: np.ndarray) -> np.ndarray:  # noqa: N802
+        return pose
+
+    CartesianMotion = Affine
+
+    def move(self, pose: np.ndarray | float, speed: float | None = None) -> None:
+        if speed is not None:
+            self.width = float(np.asarray(pose))
+            self.log.append(("open", self.width))
+            return
+        self._pose = np.asarray(pose)
+        moves = sum(entry[0] == "move" for entry in self.log)
+        self.log.append(("move", round(float(self._pose[2, 3]), 4)))
+        if moves == self._contact:
+            raise ArithmeticError
+
+    def grasp(self, width: float, *limits: float, **tolerance: float) -> None:
+        self.width = width
+        self.log.append(("grasp", *limits))
+
+    def recover_from_errors(self) -> None:
+        self.log.append(("recover",))
+
+
+FRANKA_ARGS = SimpleNamespace(**vars(ARGS), grip=20.0)
+
+
+def _franka_moves(arm: FakeFranka, decision: dict[str, Any]) -> bool:
+    return FRANKA["execute"](arm, arm, arm, decision, FRANKA_ARGS)
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi])
+def test_franka_hand_closes_along_the_tool(yaw: float):
+    """Claim: the tips reach the tool's place, fingers along its x, by the smaller turn of the
+    wrist; a grasp opens as far as the hand can, and presses once, before `act`."""
+    arm, decision = FakeFranka(yaw=yaw), _decision()
+    before = arm.current_pose.end_effector_pose.matrix
+    assert _franka_moves(arm, decision)
+    heights = [round(z + FRANKA["TIPS"], 4) for z in HEIGHTS.values()]
+    moves = [("move", z) for z in heights]
+    assert arm.log == [("open", 0.08), *moves[:2], ("grasp", 0.05, 20.0), moves[2], moves[3]]
+    tool, after = np.array(decision["waypoints"][-1]["tool"]), arm.current_pose.end_effector_pose
+    tips = after.matrix @ [0.0, 0.0, FRANKA["TIPS"], 1.0]
+    np.testing.assert_allclose(tips, tool[:, 3], atol=1e-9)
+    assert abs(after.matrix[:3, 1] @ tool[:3, 0]) == pytest.approx(1.0)
+    assert np.trace(before[:3, :3].T @ after.matrix[:3, :3]) >= 1.0 - 1e-9
+
+
+def test_franka_pushes_with_closed_fingers_and_yields_to_contact():
+    """Claim: a push closes the fingers before it; after a collision the arm goes straight up."""
+    arm, push = FakeFranka(contact=1), _decision()
+    for waypoint in push["waypoints"]:
+        waypoint["opening"] = 0.0
+    assert not _franka_moves(arm, push)
+    up = round(HEIGHTS["retreat"] + FRANKA["TIPS"], 4)
+    assert arm.log[0] == ("open", 0.0)
+    assert arm.log[3:] == [("recover",), ("move", up)]
+    with pytest.raises(ValueError, match="out of reach"):
+        _franka_moves(arm, _decision(2.0))
+
+
+def test_realsense_writes_what_act_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: image, depth in m and lens are files that the readers of `act` take."""
+    from csac_jax.deploy import image_files
+
+    counts = np.full((48, 64), 700, np.uint16)
+    lens = SimpleNamespace(width=64, height=48, fx=60.0, fy=61.0, ppx=31.5, ppy=23.5)
+    lens.coeffs = [0.0] * 5
+    video = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(intrinsics=lens))
+    colour = SimpleNamespace(get_data=lambda: np.zeros((48, 64, 3), np.uint8), profile=video)
+    frames = SimpleNamespace(
+        get_color_frame=lambda: colour,
+        get_depth_frame=lambda: SimpleNamespace(get_data=lambda: counts),
+    )
+    sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
+    device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+    pipeline = SimpleNamespace(
+        start=lambda config: SimpleNamespace(get_device=lambda: device),
+        wait_for_frames=lambda: None,
+        stop=lambda: None,
+    )
+    fake = SimpleNamespace(
+        config=lambda: SimpleNamespace(enable_stream=lambda *args: None),
+        pipeline=lambda: pipeline,
+        stream=SimpleNamespace(color=0, depth=1),
+        format=SimpleNamespace(rgb8=0, z16=1),
+        align=lambda stream: SimpleNamespace(process=lambda frames_: frames),
+    )
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    REALSENSE["main"](str(tmp_path / "shot"))
+    depth = image_files.read_depth(tmp_path / "shot" / "depth.npy")
+    np.testing.assert_allclose(depth, 0.7, rtol=1e-6)
+    assert image_files.read_rgb(tmp_path / "shot" / "rgb.png").shape == (48, 64, 3)
+    found = image_files.read_intrinsics(tmp_path / "shot" / "intrinsics.json")
+    assert (found.fx, found.fy, found.cx, found.cy) == (60.0, 61.0, 31.5, 23.5)
 
 
 def _message(pixels: np.ndarray, encoding: str, padding: int = 5, big: bool = False) -> Any:

@@ -103,11 +103,22 @@ def _reachable(
     xy, yaws = _cells(rotations, side, cell)
     if sim.robot == "hand":
         return np.ones((len(Primitive), *xy.shape[:3]), bool)
-    reachable = functools.partial(primitives.reachable, sim, heightmap)
-    for axes in ((None, 0, None), (None, 0, None), (None, 0, 0), (0, None, None)):
-        reachable = jax.vmap(reachable, axes)
     with jax.ensure_compile_time_eval():
-        return np.asarray(jax.jit(reachable)(jnp.arange(len(Primitive)), xy, yaws))
+        rows = np.asarray(jax.jit(functools.partial(reach_of_rows, sim, heightmap))(xy, yaws))
+    return np.moveaxis(rows, 1, 0).reshape(len(Primitive), *xy.shape[:3])
+
+
+def reach_of_rows(
+    sim: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaws: jax.Array
+) -> jax.Array:
+    """Tells where the arm reaches both ends of an action, a row at a time: [K * h, P, w] bool.
+
+    All cells at once take gigabytes. Args: xy [K, h, w, 2] m; yaws [K] rad.
+    """
+    reachable = functools.partial(primitives.reachable, sim, heightmap)
+    row = jax.vmap(jax.vmap(reachable, (None, 0, None)), (0, None, None))  # [P, w]
+    rows = jnp.concatenate(xy), jnp.repeat(yaws, xy.shape[1])
+    return jax.lax.map(lambda one: row(jnp.arange(len(Primitive)), *one), rows)
 
 
 @struct.dataclass

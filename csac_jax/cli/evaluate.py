@@ -275,13 +275,13 @@ def _shown(bars: Any) -> Callable[[str, str, int, int], None]:
 
 
 def _print_objects(objects: dict[str, Any]) -> None:
-    """Prints the WORST objects, by the share of their episodes at whose end they were gone."""
+    """Prints the WORST objects: how often each was drawn, and how often it was gone at the end."""
     from rich.console import Console
     from rich.table import Table
 
     shares = sorted(objects.items(), key=lambda item: item[1]["gone"] / item[1]["episodes"])
     title = f"objects that stayed most often, of {len(objects)}"
-    table = Table("object", "gone", "episodes", title=title)
+    table = Table("object", "gone", "drawn", title=title)
     for name, entry in shares[:WORST]:
         table.add_row(name, str(entry["gone"]), str(entry["episodes"]))
     Console(highlight=False).print(table)

@@ -135,7 +135,7 @@ def summarise(episodes: Episodes) -> dict[str, Any]:
 
 
 def by_object(names: np.ndarray, in_play: np.ndarray, left: np.ndarray) -> dict[str, Any]:
-    """Counts, for each object, the episodes that had it and those in which it was gone at the end.
+    """Counts how often each object was drawn (`episodes`), and how often it was gone at the end.
 
     Args: all [M, N] by slots: names, and whether it was in play at the start and at the end.
     """

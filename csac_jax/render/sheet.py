@@ -17,18 +17,21 @@ from csac_jax.world import blocks
 
 MOST = 120  # objects on a sheet
 _COLUMNS, _INCHES, _DOTS = 8, 1.5, 90
+_TITLE = 0.33  # inches above a row, for name and size
 
 
 def write(path: Path, objects: Sequence[Object]) -> None:
     """Draws at most MOST objects at one scale and writes the picture."""
     shown = objects[:MOST]
-    rows = math.ceil(len(shown) / _COLUMNS)
-    figure = Figure(figsize=(_INCHES * _COLUMNS, 1.25 * _INCHES * rows), dpi=_DOTS)
+    columns = min(len(shown), _COLUMNS)
+    rows = math.ceil(len(shown) / columns)
+    height = (_INCHES + _TITLE) * rows
+    figure = Figure(figsize=(_INCHES * columns, height), dpi=_DOTS)
     reach = 0.4 * max(float(np.ptp(member.bounds, axis=0).max()) for member in shown)
     for number, member in enumerate(shown):
-        axes = figure.add_subplot(rows, _COLUMNS, number + 1, projection="3d")
+        axes = figure.add_subplot(rows, columns, number + 1, projection="3d")
         _draw(axes, member, reach, blocks.COLOURS[number % len(blocks.COLOURS)])
-    figure.subplots_adjust(0.0, 0.0, 1.0, 0.95, 0.0, 0.3)
+    figure.subplots_adjust(0.0, 0.0, 1.0, 1.0 - _TITLE / height, 0.0, _TITLE / _INCHES)
     media.write_picture(path, heatmaps.pixels(figure))
 
 

@@ -260,4 +260,5 @@ def markdown(report: ResultReport) -> str:
     sections = {title: table_text(table) for title, table in tables(report).items()}
     if report.notes:
         sections["Notes"] = "\n".join(f"- {note}" for note in report.notes)
-    return "\n\n".join([EXPLAINED, *(f"## {t}\n\n{text}" for t, text in sections.items())]) + "\n"
+    sections["How to read the tables"] = EXPLAINED
+    return "\n\n".join(f"## {title}\n\n{text}" for title, text in sections.items()) + "\n"
