@@ -52,8 +52,8 @@ def quick() -> Config:
         net=SMALL_NET | {"subpixel": 2, "growth": 24, "rotations": 8},
         policy={"augment": True},
         target={"gamma": 0.2},
-        explore={"epsilon_decay": 0.995},
-        learn={"actor_batch": 8, "updates_per_step": 1, "learning_rate": 4e-3},
+        explore={"epsilon_place": (0.25, 0.0), "epsilon_decay": 0.995},
+        learn={"actor_batch": 8, "updates_per_step": 1, "learning_rate": 4e-3, "augment_shift": 4},
         replay={"end": (1.0, 4.0)},
     )
 
@@ -116,7 +116,7 @@ def objects() -> Config:
         sim={"clearance": 0.004, "contacts": 128},
         net={"growth": SMALL_NET["growth"]},
         reward=STRICT_REWARD,
-        explore={"epsilon_decay": 0.9995},
+        explore={"epsilon_place": (0.5, 0.0), "epsilon_decay": 0.9995},
         learn={"augment_shift": 8, "updates_per_step": 2, "learning_rate": 1e-3},
         replay={"capacity": 16384},
         train={"actions": 24000, "learning_starts": 128, "chunk": 20, "save_every": 10},
