@@ -154,7 +154,7 @@ def standard(cfg: Config, suite: str) -> Config:
     """Returns a policy's config with one world where it trained in many, for the suites of all.
 
     A hand that varies becomes the RG2, a drawn grip the gripper's own, and of views from above and
-    aside the exact one from above is taken. Certified scenes are training's alone. `in_distribution`
+    aside the exact one from above is taken; its certified scenes are left out. `in_distribution`
     keeps what training had.
     """
     if suite == IN_DISTRIBUTION:
