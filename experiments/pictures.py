@@ -108,12 +108,12 @@ def freeing() -> Iterator[tuple[np.ndarray, int]]:
 
 
 def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
-    """Yields pictures and times, ms: the shipped policy takes the pinwheel apart."""
+    """Yields pictures and times, ms: `shipped` takes the pinwheel apart."""
     return moving("shipped", str(cases.shipped("pinwheel")), PINWHEEL, every=2)
 
 
 def pile() -> Iterator[tuple[np.ndarray, int]]:
-    """Yields pictures and times, ms: the policy for large piles clears thirty blocks."""
+    """Yields pictures and times, ms: `shipped_clutter` clears thirty blocks."""
     return moving("shipped_clutter", "random30", PILE, every=4, hold=3 * FRAME_MS)
 
 

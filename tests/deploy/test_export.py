@@ -53,7 +53,7 @@ _BY_ONNXRUNTIME = _ALONE.format(
 
 
 def _alone(script: str, file: Path, *options: str, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Exports the shipped policy and runs the file in a process of its own."""
+    """Exports a policy that ships and runs the file in a process of its own."""
     assert cli.main(["export", "shipped_clutter", str(file), *options]) == 0
     np.savez(file.with_suffix(".npz"), **arrays)
     command = [sys.executable, "-c", script, str(file), str(file.with_suffix(".npz"))]
