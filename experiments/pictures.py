@@ -122,7 +122,8 @@ def moving(
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures [H, W, 3] uint8 of an episode and times, ms; `hold` for a motion's end."""
     policy = policies.load(source)
-    prepared = suites.prepare(suites.standard(policy.cfg, suite), suite, 1, seed, "c")
+    cfg = suites.standard(policy.cfg, suite).change(task={"kind": "clear"})
+    prepared = suites.prepare(cfg, suite, 1, seed, "c")
     (env,) = prepared.parts.values()
     steps = list(rollout.episode(env, policies.in_world(policy, env.cfg), seed))
     print(suite, episode.summary(env, steps))
