@@ -65,7 +65,7 @@ bench: $(STAMP)  ## measure this machine by the main benchmarks, into build/benc
 pictures: $(STAMP)  ## draw the pictures of README and docs (4 minutes)
 	$(BIN)/python -m experiments.pictures
 	$(BIN)/csac-jax play --scene pinwheel --robot ur5 --policy $(VIEWED) --size 960 720 --png docs/pictures/views.png
-	$(BIN)/csac-jax play --scene pile --objects procedural:0:200 --policy $(VIEWED) --png docs/pictures/objects.png
+	$(BIN)/csac-jax play --scene pile --objects procedural:0:200 --policy $(VIEWED) --size 960 720 --png docs/pictures/objects.png
 
 figures: $(STAMP)  ## the tables and figures of docs/ that are made from the recorded results
 	$(BIN)/python -m experiments.summary

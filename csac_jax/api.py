@@ -256,8 +256,8 @@ def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], 
     policy = policies.load(source)
     assert isinstance(policy, policies.NetworkPolicy)
     params, wanted = policy.params, actor_critic.abstract_params(cfg)
-    # Inputs may be missing at the end: colours, heights, gripper and target are in this order.
-    if not policy.cfg.task.has_target and policy.cfg.net.colour == cfg.net.colour:
+    # Inputs may be missing at the end: colours, heights, gripper and mask are in this order.
+    if not policy.cfg.sees_mask and policy.cfg.net.colour == cfg.net.colour:
         params = actor_critic.with_inputs(params, wanted)
     if leaves.layout(params) != leaves.layout(wanted):
         fault = "its networks are not those of these settings"
@@ -272,8 +272,9 @@ def match_networks(cfg: Config, source: str | Path) -> Config:
     stored = policies.load_config(source)
     learn = {"critics": stored.learn.critics, "actor": stored.learn.actor}
     net = stored.net
-    if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet) and cfg.net.gripper:
-        net = dataclasses.replace(net, gripper=True)
+    if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet):
+        mask = net.mask or (stored.sees_mask and not cfg.task.has_target)
+        net = dataclasses.replace(net, gripper=net.gripper or cfg.net.gripper, mask=mask)
     return cfg.change(net=net, learn=learn)
 
 

@@ -246,6 +246,7 @@ class SmallNet(_AnyNet):
     canvas_step: ClassVar[int] = 4  # whole cells at either stride
     kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     gripper: bool = False  # See the gripper's opening and the size of its fingers.
+    mask: bool = False  # See the mask of what is wanted also where all is, as in the task clear.
     growth: int = number(24, 4, 1024)  # Channels that each dense layer adds.
     dilations: tuple[int, ...] = number((1, 2, 4, 1), 1, 64)  # Dilation of each dense layer, 3 x 3.
     stem: int = number(16, 4, 4096)  # Channels of the first convolution.
@@ -263,6 +264,7 @@ class DenseNet121(_AnyNet):
     block_layers: ClassVar[tuple[int, int, int, int]] = (6, 12, 24, 16)  # arXiv:1608.06993, table 1
     block_growth: ClassVar[int] = 32  # channels that each dense layer adds (the same)
     gripper: ClassVar[bool] = False  # no trunk sees the gripper
+    mask: ClassVar[bool] = False  # a trunk sees the target's where the task has one
     STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
     upsample: ClassVar[int] = 2  # pixels of the input per cell of the map, along each axis (VPG)
     canvas_step: ClassVar[int] = STRIDE // upsample  # map cells per cell of the features
@@ -475,6 +477,11 @@ class Config(Section):
     learn: LearnConfig = LearnConfig()
     replay: ReplayConfig = BetaReplay()
     train: TrainConfig = TrainConfig()
+
+    @property
+    def sees_mask(self) -> bool:
+        """Returns whether the networks see the mask of what is wanted."""
+        return self.task.has_target or self.net.mask
 
     def change(self, **sections: Any) -> "Config":
         """Returns a config with other values: `cfg.change(seed=1, learn={"batch": 64})`.

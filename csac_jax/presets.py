@@ -131,7 +131,7 @@ def objects_target() -> Config:
 def grippers() -> Config:
     """Learns to clear ten blocks with any gripper, whose size differs in every episode.
 
-    The net sees opening and fingers. It starts from a policy of blocks: `--init shipped`.
+    The net sees opening and fingers. It starts from a policy of blocks: `--init shipped_clutter`.
     """
     random = {"epsilon_primitive": (0.2, 0.1), "epsilon_place": (0.2, 0.0)}
     return TEN_BLOCKS.change(

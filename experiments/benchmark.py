@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from csac_jax import cli
-from csac_jax.evaluation import suites
+from csac_jax.evaluation import policies, suites
 from csac_jax.evaluation.statistics import Band
 from csac_jax.io import files, policy_file
 from csac_jax.report import suite_table
@@ -61,13 +61,11 @@ PUBLISHED: dict[str, tuple[Published, ...]] = {
 def measure(name: str, out: Path, share: float) -> int:
     """Measures a policy in all suites that fit it; returns the first exit code that is not 0."""
     source, kind = ("shipped", name) if name in BASELINES else (name, "learned")
-    asks_target = name == "shipped_target"
+    knows_target = kind != "learned" or policies.load_config(source).task.has_target
     for has_objects, names in SUITES.items():
-        fits = [s for s in names if kind != "learned" or suites.SUITES[s].target == asks_target]
+        fits = [suite for suite in names if knows_target or not suites.SUITES[suite].target]
         command = ["eval", source, "--policy", kind, "--physics", "c", "--share", str(share)]
         command += ["--out", str(out / name), "--suites", *fits]
-        if name == "shipped_grippers":
-            command += ["--sim.gripper", "varied"]
         if has_objects:
             command += ["--objects", OBJECTS, "--sim.clearance", CLEARANCE]
         if fits and (code := cli.main(command)):

@@ -87,8 +87,9 @@ def _smaller(image: np.ndarray) -> np.ndarray:
 
 def freeing() -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures and times, ms: an arm pushes blocks apart and takes the yellow one."""
-    policy = policies.make("learned+planner", "shipped_target")
-    prepared = suites.prepare(policy.cfg, "enclosed", 1, FREEING, "c", "ur5e")
+    policy = policies.make("learned+planner", "shipped")
+    cfg = suites.standard(policy.cfg, "enclosed")
+    prepared = suites.prepare(cfg, "enclosed", 1, FREEING, "c", "ur5e")
     (env,) = prepared.parts.values()
     steps = list(rollout.episode(env, policies.in_world(policy, env.cfg), FREEING))
     print("enclosed", episode.summary(env, steps))
@@ -107,22 +108,24 @@ def freeing() -> Iterator[tuple[np.ndarray, int]]:
 
 
 def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
-    """Yields pictures and times, ms: the shipped policy takes the pinwheel apart."""
-    return moving(str(cases.shipped("pinwheel")), PINWHEEL, every=2)
+    """Yields pictures and times, ms: `shipped` takes the pinwheel apart."""
+    return moving("shipped", str(cases.shipped("pinwheel")), PINWHEEL, every=2)
 
 
 def pile() -> Iterator[tuple[np.ndarray, int]]:
-    """Yields pictures and times, ms: the shipped policy clears thirty blocks."""
-    return moving("random30", PILE, every=4, hold=3 * FRAME_MS)
+    """Yields pictures and times, ms: `shipped_clutter` clears thirty blocks."""
+    return moving("shipped_clutter", "random30", PILE, every=4, hold=3 * FRAME_MS)
 
 
 def moving(
-    suite: str, seed: int, every: int, hold: int = END_MS
+    source: str, suite: str, seed: int, every: int, hold: int = END_MS
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures [H, W, 3] uint8 of an episode and times, ms; `hold` for a motion's end."""
-    policy = policies.load("shipped")
-    (env,) = suites.prepare(policy.cfg, suite, 1, seed, "c").parts.values()
-    steps = list(rollout.episode(env, policy.replace(cfg=env.cfg), seed))
+    policy = policies.load(source)
+    cfg = suites.standard(policy.cfg, suite).change(task={"kind": "clear"})
+    prepared = suites.prepare(cfg, suite, 1, seed, "c")
+    (env,) = prepared.parts.values()
+    steps = list(rollout.episode(env, policies.in_world(policy, env.cfg), seed))
     print(suite, episode.summary(env, steps))
     yield from _pictures(env, steps, every, hold)
 

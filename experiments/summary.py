@@ -18,17 +18,19 @@ from experiments.index import RESULTS, STUDY
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "results.md"
 BEGIN = "<!-- The rest is written by `python -m experiments.summary`. -->\n"
-FAMILIES = ("fast", "grippers", "objects", "paper", "quick")
+FAMILIES = ("fast", "general", "objects", "paper", "quick")
 POLICIES = {
-    "shipped": ("fast/shipped/seed-0", ("random10-c", "random30-c", "packed", "cases-c")),
+    "shipped": (
+        "general/first/seed-1",
+        (
+            *("random10", "random30", "packed", "cases", "pile", "objects_packed", "objects10"),
+            *("target", "target_objects", "blocked", "enclosed", "tray", "hidden"),
+        ),
+    ),
     "shipped_clutter": (
         "fast/clutter/seed-1",
         ("random10-high", "random30-high", "packed-high", "cases-high"),
     ),
-    "shipped_camera": ("fast/camera/seed-0", ("random10", "random30", "packed", "cases")),
-    "shipped_grippers": ("grippers/from_shipped_gpu/seed-0", ("rg2", "2f85", "franka_hand")),
-    "shipped_objects": ("objects/gpu_cones/seed-7", ("pile", "objects_packed", "objects10")),
-    "shipped_target": ("objects/gpu_target/seed-0", ("target_objects",)),
 }
 """Policy -> folder of its run, and its evaluations."""
 TRAINED = {
@@ -64,8 +66,6 @@ def _policies(evaluations: Sequence[results.Evaluation]) -> Iterator[dict[str, s
             parts = [one for one in evaluations if one.path.as_posix().endswith(f"/{path}")]
             (score,) = comparison.build(results.Results([], parts, [])).scores
             place = score.suite if len(parts) == 1 else f"{score.suite}, mean of {len(parts)}"
-            if policy == "shipped_grippers":
-                place = f"{score.suite}, gripper {name}"
             yield {"policy": f"`{policy}`", "suite": place} | {
                 "episodes": str(score.episodes * len(parts)),
                 **{METRICS[key]: shown(score.band(key), metric=key) for key in SHOWN},

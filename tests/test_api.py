@@ -46,18 +46,21 @@ def test_public_names_exist():
 def test_public_objects_have_short_texts():
     """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
     cfg, key = SMOKE, jax.random.key(0)
-    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped")
+    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped_clutter")
     state = jax.jit(env.reset)(key)
     arms = [kind(cfg) for kind in policies.BASELINES.values()]
     objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned, *arms]
-    objects += [csac_jax.deploy.CameraPolicy.load("shipped"), policies.PlannerPolicy(cfg, learned)]
+    objects += [
+        csac_jax.deploy.CameraPolicy.load("shipped_clutter"),
+        policies.PlannerPolicy(cfg, learned),
+    ]
     objects += [learned.debug(state, key), suites.prepare(cfg, "in_distribution", 2)]
     objects += [api.Run(Path("run"), cfg, SUMMARY, {})]
     texts = list(map(repr, objects))
     assert [text for text in texts if len(text) > 400 or "\n" in text] == []
     params = jax.tree.leaves(learned.params)
     numbers = sum(leaf.size for leaf in params)
-    named = f"cfg=<fast, csac_beta, seed 0>, params=<{len(params)} arrays, {numbers:,} numbers>"
+    named = f"cfg=<fast, csac_beta, seed 1>, params=<{len(params)} arrays, {numbers:,} numbers>"
     assert repr(learned) == f"NetworkPolicy({named})"
     assert "reward=0.0, terminated=False" in repr(state)
 
@@ -139,6 +142,26 @@ def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
     )
     np.testing.assert_allclose(found.q, wanted.q, rtol=1e-5, atol=1e-5)
     _assert_same(state.target, state.online)
+
+
+def test_task_without_targets_starts_from_a_policy_that_sees_them(tmp_path: Path):
+    """Claim: a net that knows both tasks starts the task `clear`, whose net then sees the mask too;
+    with all marked, the maps and valid cells are the same."""
+    path, both = tmp_path / "policy.safetensors", SMOKE.change(task={"kind": "both"})
+    params = _policy(path, both)
+    cfg = api.match_networks(SMOKE, path)
+    assert cfg == SMOKE.change(net={"mask": True})
+    assert not api.match_networks(both, path).net.mask
+    start = api.initial_networks(cfg, path)
+    assert start is not None
+    state, rows = start(_learner_state(cfg)), (1, SMOKE.heightmap.size, SMOKE.heightmap.size)
+    obs = Observation(jnp.ones((*rows, 3)), jnp.full(rows, 0.05), jnp.ones(rows, bool))
+    found, wanted = (
+        jax.jit(functools.partial(values.dense_maps, actor_critic.make(one)))(networks, obs)
+        for one, networks in ((cfg, state.online), (both, params))
+    )
+    np.testing.assert_array_equal(found.q, wanted.q)
+    np.testing.assert_array_equal(found.valid, wanted.valid)
 
 
 _DENSENET = {"net": {"kind": "densenet121"}}

@@ -225,7 +225,7 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
             )
         )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
-    assert api.match_networks(CONFIG, "shipped").net.gripper
+    assert api.match_networks(CONFIG, "shipped_clutter").net.gripper
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)
         policy_file.save(path, _networks(other), other)

@@ -21,7 +21,13 @@ from jax._src.export import serialization  # isort: skip
 ROOT = Path(csac_jax.__file__).parents[1]
 PINS = (ROOT / "requirements.txt").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-DATA = ("policies/clear.safetensors", "report/page.html", "py.typed", "_scenes/ur5.xml")
+DATA = (
+    "policies/shipped.safetensors",
+    "policies/shipped.md",
+    "report/page.html",
+    "py.typed",
+    "_scenes/ur5.xml",
+)
 COMMANDS = (
     "train smoke --run-dir run",
     "eval run --episodes 2 --json run/eval.json",

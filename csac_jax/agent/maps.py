@@ -66,7 +66,7 @@ def frames(cfg: Config, networks: Networks) -> Frames:
         cell=cell,
         extent=extent,
         push_length=cfg.sim.push_length,
-        shows_target=cfg.task.has_target,
+        shows_target=cfg.sees_mask,
         all_cells=cfg.policy.action_mask == "none",
         walls=_walls(cfg),
         xy=xy,

@@ -16,7 +16,7 @@ class PolicyOptions:
     policy: tyro.conf.Positional[str]
     """A policy file, one that comes with the package, such as shipped, or a run's folder."""
     gripper: str | None = None
-    """The robot's gripper, by name or folder; by default that of the training."""
+    """The robot's gripper, by name or folder; by default the policy's, of `shipped` the RG2."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from csac_jax.sweeps import grid
 EXAMPLES = (
     "quick --seeds 8",
     "quick --seeds 4 --vary replay.sampler=uniform,beta --vary learn.tau=0.01,0.02",
-    "fast --seeds 4 --devices 4 --init shipped",
+    "fast --seeds 4 --devices 4 --init shipped_clutter",
     "paper_small --vary algo=csac,csac_beta --vary task=clear,packed --evaluate 500",
 )
 

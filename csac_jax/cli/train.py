@@ -14,7 +14,7 @@ from csac_jax.runtime import signals
 EXAMPLES = (
     "quick                               # 2,000 actions, minutes on two cores",
     "quick --algo vpg --seed 1           # another algorithm and seed",
-    "fast --init shipped                 # start from the shipped policy's networks",
+    "fast --init shipped_clutter         # start from the networks of a policy that ships",
     "quick --replay.sampler beta --replay.end 1 4",
     "--config my.toml --learn.tau 0.02   # settings in a file, flags win over it",
     "quick --eval-every 500 --log wandb  # evaluated during training, and tracked",

@@ -64,8 +64,8 @@ class CameraPolicy:
         """Loads a shipped policy, a policy file, or a run's folder, which needs MuJoCo.
 
         Args: workspace_pose, 4 x 4, workspace to robot frame; the identity by default. gripper, the
-        robot's, by name or folder; by default that of the training, and another one is a warning.
-        A policy for any gripper must know it before it decides.
+        robot's, by name or folder; by default the policy's, of `shipped` the RG2. Another one is a
+        warning, except for a policy that knows any; one whose own varies needs it to decide.
         Raises FileNotFoundError, PolicyFileError, CheckpointError or SettingsError.
         """
         path = policy_file.find(source)

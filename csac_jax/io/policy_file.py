@@ -19,22 +19,24 @@ from csac_jax import grippers, reading
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
 from csac_jax.config import Config
-from csac_jax.errors import DataWarning, FailedError
+from csac_jax.errors import DataWarning, FailedError, SettingsError
 from csac_jax.io import configs, files, leaves
 from csac_jax.runtime import provenance
 
 _FOLDER = Path(__file__).parents[1] / "policies"
 _DIGESTS = {  # so that a replaced file is detected
-    "clear": "28e4450df466158ece399eace4a792748c65f3d430210f145b6621c4d5344cd2",
-    "camera": "70db3538a3e81cedb314b57c6e1ee72db42eedc20d06a30b20d2d68ccfa9070f",
-    "clutter": "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
-    "general": "3b6006bd1d0bf9c324275f3d11015a9ea902087ad1725adedac29f0d5ac470ac",
-    "grippers": "dddb79b4b7ec1205ef751218c81d727604605eb91f4b0bcbfe8c934016cf6f19",
-    "objects": "12bf20a8a5597f313de22580922bfa6b0ac89f614ae06d4afe401f81f1ad425e",
-    "target": "74f90256dfb15d9c89fb6d5c95382ed80eab0050ce6200426fe52a07a857ab8e",
+    "shipped": "b855b9229518c7e15de35f0263f755360853b8156274ed3720d394916280e7f0",
+    "shipped_clutter": "cf3f9ff4b12320842f72adeea50d832eab83c7fe79541f559066e1ed297e2ef2",
 }
-_SHA256 = {_FOLDER / f"{name}.safetensors": digest for name, digest in _DIGESTS.items()}
-SHIPPED = {f"shipped_{path.stem}".removesuffix("_clear"): path for path in _SHA256}
+SHIPPED = {name: _FOLDER / f"{name}.safetensors" for name in _DIGESTS}
+_SHA256 = {path: _DIGESTS[name] for name, path in SHIPPED.items()}
+_RETIRED = {  # name of an earlier version -> how `shipped` does what it did
+    "shipped_camera": "",
+    "shipped_general": "",
+    "shipped_grippers": ", which takes any hand by --sim.gripper, or --gripper at a robot",
+    "shipped_objects": "",
+    "shipped_target": ", which gets what a mask marks, or takes all without one",
+}
 _CONFIG, _VERSIONS, _DIGEST = "config", "versions", "sha256"  # names of the file's remarks
 _GRIPPER = "gripper"  # remark of older files: the numbers of the user's own gripper
 
@@ -73,9 +75,12 @@ def _digest(remarks: dict[str, str], tensors: dict[str, np.ndarray]) -> str:
 
 
 def find(source: str | Path) -> Path:
-    """Returns the policy file or run folder that `source` names. Raises FileNotFoundError."""
+    """Returns the policy file or run folder that `source` names. Raises FileNotFoundError, and
+    SettingsError for a policy of an earlier version."""
     path = SHIPPED.get(str(source), Path(source))
     if not path.exists():
+        if (instead := _RETIRED.get(str(source))) is not None:
+            raise SettingsError(f"{source} ships no more; use shipped{instead}")
         known = f"give the folder of a run, a policy file, or one of {', '.join(SHIPPED)}"
         raise FileNotFoundError(f"there is no folder {path}; {known}")
     return path

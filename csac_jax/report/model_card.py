@@ -40,8 +40,16 @@ def read(paths: Sequence[Path]) -> list[dict[str, Any]]:
 def write(
     file: Path, cfg: Config, evaluated: Sequence[dict[str, Any]], record: dict[str, Any]
 ) -> Path:
-    """Writes the card of a policy file with its results; `record` is the `train.json` of its run,
-    or empty. Returns the card's path."""
+    """Writes the card of a policy file, see `text`; returns the card's path."""
+    files.replace(card := file.with_name(CARD), text(file, cfg, evaluated, record))
+    return card
+
+
+def text(
+    file: Path, cfg: Config, evaluated: Sequence[dict[str, Any]], record: dict[str, Any]
+) -> str:
+    """Returns the card of a policy file with its results; `record` is the `train.json` of its run,
+    or empty."""
     head = {**HEAD, "model-index": model_index(file.stem, evaluated)}
     front = yaml.safe_dump(head, sort_keys=False, allow_unicode=True)
     table = suite_table.markdown(suite_table.rows(evaluated))
@@ -51,8 +59,7 @@ def write(
     use = f"    csac-jax play --policy {file.name} --video episode.webp"
     parts = (f"# {file.stem}", f"A policy of csac_jax for {made}.", use, about)
     body = "\n\n".join([*parts, "## Results", table.rstrip(), "## Limitations", LIMITS])
-    files.replace(card := file.with_name(CARD), f"---\n{front}---\n\n{body}\n")
-    return card
+    return f"---\n{front}---\n\n{body}\n"
 
 
 def model_index(name: str, evaluated: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -76,7 +83,7 @@ def model_index(name: str, evaluated: Sequence[dict[str, Any]]) -> list[dict[str
 
 def _about(file: Path, cfg: Config, record: dict[str, Any]) -> cells.ResultTable:
     digest = hashlib.sha256(file.read_bytes()).hexdigest()
-    command = variants.train_command(configs.to_dict(cfg))
+    command = variants.train_command(record.get("config") or configs.to_dict(cfg))
     rows = {
         "licence": "Apache-2.0",
         "file": f"`{file.name}`, {file.stat().st_size:,} bytes, SHA-256 `{digest}`",

@@ -48,7 +48,8 @@ class Loop(NamedTuple):
 def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
     """Makes the loop of the policy `source`, see `Policy.load`, in random10."""
     policy = CameraPolicy.load(source)
-    clear = policy.cfg.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
+    world = suites.standard(policy.cfg, "random10")
+    clear = world.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
     cfg = clear.change(sim={"physics": "c", "robot": robot})
     (env,) = suites.prepare(cfg, "random10", episodes, seed).parts.values()
     return Loop(policy, env, episodes, seed)

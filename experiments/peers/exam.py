@@ -21,7 +21,7 @@ from experiments.peers import clutter_removal
 from experiments.peers.clutter_removal import Image, Peer, View
 
 BASELINES = ("random", "geometric")  # policies without networks that need no more than an image
-BASE = "shipped_objects"  # whose config they take
+BASE = "shipped"  # whose config they take
 FAILURES = 2  # in a row end a round
 
 Decide = Callable[[jax.Array, Image], Decision | None]

@@ -27,7 +27,7 @@ EMPTY = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
 @pytest.fixture
 def given(tmp_path: Path) -> list[str]:
     """The policy and the files of an image of two blocks."""
-    return ["shipped", *image_files.write(tmp_path, IMAGE)]
+    return ["shipped_clutter", *image_files.write(tmp_path, IMAGE)]
 
 
 def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -39,7 +39,7 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
     assert "trained with view exact maps from above, not noisy images of an obl" in printed.err
     lines = printed.out.splitlines()
     result = json.loads((tmp_path / "out.json").read_text())
-    wanted = CameraPolicy.load("shipped").decide(*IMAGE, top=2)
+    wanted = CameraPolicy.load("shipped_clutter").decide(*IMAGE, top=2)
     assert len(lines) == len(result["decisions"]) == 2
     for line, found, decision in zip(lines, result["decisions"], wanted, strict=True):
         assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line
@@ -49,7 +49,7 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
     assert imageio.imread(tmp_path / "out.png").shape == (640, 1248, 3)
     (tmp_path / "out.png").unlink()
     empty = image_files.write(tmp_path / "empty", EMPTY)
-    assert cli.main(["act", "shipped", *empty, *files[2:]]) == 0
+    assert cli.main(["act", "shipped_clutter", *empty, *files[2:]]) == 0
     assert capsys.readouterr().out == "nothing to act on\n"
     assert (tmp_path / "out.png").stat().st_size > 10_000
 
@@ -85,7 +85,7 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     names = ("rgb.png", "depth.npy", "intrinsics.json", "pose.json")
     paths = [record / "000001" / name for name in names]
     files = [part for path in paths for part in (f"--{path.stem}", str(path))]
-    assert cli.main(["act", "shipped", *files]) == 0
+    assert cli.main(["act", "shipped_clutter", *files]) == 0
     assert capsys.readouterr().out.splitlines() == [first]
     depth = imageio.imread(tmp_path / "depth.png")
     imageio.imwrite(tmp_path / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
@@ -107,7 +107,10 @@ def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture)
         (beside, 1, "too little of the workspace is seen"),
     ):
         options, json_file = image_files.write(tmp_path, image), tmp_path / "report.json"
-        assert cli.main(["act", "shipped", *options, "--check", "--json", str(json_file)]) == code
+        assert (
+            cli.main(["act", "shipped_clutter", *options, "--check", "--json", str(json_file)])
+            == code
+        )
         captured = capsys.readouterr()
         assert line in captured.out + captured.err
         assert re.search(r"^table +[-+]\d+\.\d mm from z = 0, tilted by", captured.out)
@@ -170,7 +173,7 @@ LENS = "--rgb a.png --intrinsics c.json"
         ("finetune shipped nowhere --batch 0", "--batch: "),
         ("finetune shipped nowhere --learning-rate 0", "--learning-rate: "),
         ("finetune shipped nowhere --seed -1", "--seed: "),
-        ("export shipped p.safetensors --average shipped_target", "has critic.params."),
+        ("export shipped p.safetensors --average shipped_clutter", "has critic.params."),
         ("export shipped p.onnx", "p.onnx: the name must end in .safetensors, see --format"),
         ("export shipped p.onnx --format onnx --input image", "needs --format stablehlo"),
         ("export shipped p.stablehlo --format stablehlo --size 8 8", "--size: "),

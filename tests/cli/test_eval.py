@@ -83,7 +83,7 @@ def test_a_result_names_its_policy(flags: str, name: str):
 def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
     """Claim: a policy that was trained with objects has none in the result of a suite of blocks."""
     monkeypatch.setattr(rollout, "evaluate", lambda *_, **__: dict(TABLE))
-    options = evaluate.EvalOptions("shipped_objects", policy="random")
+    options = evaluate.EvalOptions("shipped", policy="random")
     result = evaluate._measure(lambda *_: None, options, {}, "cases", 1)
     assert "objects" not in result
 
@@ -92,20 +92,19 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
     """Claim: `--suites all` leaves out suites with targets for a policy trained without, those
     without targets for one trained with, none of these for one trained in both tasks, and suites of
     objects where there is no library."""
-    clear, target = (policies.load_config(name) for name in ("shipped", "shipped_target"))
-    options = evaluate.EvalOptions("shipped")
+    clear, both = (policies.load_config(name) for name in ("shipped_clutter", "shipped"))
+    options = evaluate.EvalOptions("shipped_clutter")
     of_blocks = {name for name, one in suites.SUITES.items() if not (one.target or one.objects)}
     assert {*evaluate._fitting(options, clear)} == of_blocks >= {"random10", "cases", "camera"}
-    with_objects = evaluate.EvalOptions("shipped", objects="procedural:0:20")
+    with_objects = evaluate.EvalOptions("shipped_clutter", objects="procedural:0:20")
     assert "pile" in evaluate._fitting(with_objects, clear)
-    assert evaluate._fitting(with_objects, target) == (
+    assert evaluate._fitting(with_objects, clear.change(task={"kind": "target"})) == (
         "target",
         "target_objects",
         "enclosed",
         "hidden",
     )
-    both = evaluate._fitting(with_objects, clear.change(task={"kind": "both"}))
-    assert {*both} == set(suites.SUITES)
+    assert {*evaluate._fitting(options, both)} == set(suites.SUITES)
     anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 

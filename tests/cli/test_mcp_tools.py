@@ -33,7 +33,7 @@ def _call(policy: CameraPolicy, name: str, arguments: dict[str, Any]) -> Any:
 def test_tools_answer_as_the_commands(tmp_path: Path):
     """Claim: `decide` returns what `CameraPolicy.decide` does for the files of an image, `policies`
     those that ship; a missing file and too many episodes are errors that say so."""
-    policy = CameraPolicy.load("shipped")
+    policy = CameraPolicy.load("shipped_clutter")
     flags = image_files.write(tmp_path, IMAGE)
     paths = {
         flag.removeprefix("--"): path for flag, path in zip(flags[::2], flags[1::2], strict=True)

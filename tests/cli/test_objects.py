@@ -103,8 +103,11 @@ def test_without_the_extra_the_command_says_so(
 def test_suites_need_a_library(capsys: Capture):
     """Claim: `eval` and `play` refuse a suite of objects without a library, and the other way."""
     for arguments, message in (
-        (["eval", "shipped", "--suite", "pile"], "objects: pile needs a library"),
-        (["eval", "shipped", "--objects", "x"], "'in_distribution' has no objects of a library"),
+        (["eval", "shipped_clutter", "--suite", "pile"], "objects: pile needs a library"),
+        (
+            ["eval", "shipped_clutter", "--objects", "x"],
+            "'in_distribution' has no objects of a library",
+        ),
         (["play", "--scene", "pile"], "objects: pile needs a library"),
     ):
         assert cli.main(arguments) == 2

@@ -45,13 +45,13 @@ def test_taken_port_is_told_first(
     (tmp_path / "token").write_text(TOKEN)
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = str(other.getsockname()[1])
-        assert cli.main(["serve", "shipped", "--port", port]) == 1
+        assert cli.main(["serve", "shipped_clutter", "--port", port]) == 1
     error = capsys.readouterr().err
     assert error == (
         f"csac-jax: 127.0.0.1:{port}: Address already in use; give another --port or --host\n"
     )
     options = ["--host", "192.0.2.1", "--port", port, "--token-file", str(tmp_path / "token")]
-    assert cli.main(["serve", "shipped", *options]) == 1
+    assert cli.main(["serve", "shipped_clutter", *options]) == 1
     assert capsys.readouterr().err.startswith(f"csac-jax: 192.0.2.1:{port}: Cannot assign")
 
 
@@ -63,7 +63,7 @@ def test_serves_until_it_is_stopped(tmp_path: Path):
     token.write_text(f"{TOKEN}\n")
     camera_image.main(str(tmp_path))
     options = ["--port", "0", "--token-file", str(token)]
-    command = [sys.executable, "-m", "csac_jax", "serve", "shipped", *options]
+    command = [sys.executable, "-m", "csac_jax", "serve", "shipped_clutter", *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -115,7 +115,7 @@ def test_memory_is_bounded():
     """Claim: the service needs less than 2 GiB on two cores, and 0.4 for each further thread, while
     the largest images wait and others send the largest bodies without an end."""
     assert SIDE**2 == requests.MOST_PIXELS
-    command = [sys.executable, "-m", "csac_jax", "serve", "shipped", "--port", "0"]
+    command = [sys.executable, "-m", "csac_jax", "serve", "shipped_clutter", "--port", "0"]
     with contextlib.ExitStack() as stack:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         stack.callback(process.wait)

@@ -53,8 +53,8 @@ _BY_ONNXRUNTIME = _ALONE.format(
 
 
 def _alone(script: str, file: Path, *options: str, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Exports the shipped policy and runs the file in a process of its own."""
-    assert cli.main(["export", "shipped", str(file), *options]) == 0
+    """Exports a policy that ships and runs the file in a process of its own."""
+    assert cli.main(["export", "shipped_clutter", str(file), *options]) == 0
     np.savez(file.with_suffix(".npz"), **arrays)
     command = [sys.executable, "-c", script, str(file), str(file.with_suffix(".npz"))]
     env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
@@ -65,7 +65,7 @@ def _alone(script: str, file: Path, *options: str, **arrays: np.ndarray) -> list
 
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
-    return CameraPolicy.load("shipped")
+    return CameraPolicy.load("shipped_clutter")
 
 
 @pytest.fixture(scope="module")
@@ -199,12 +199,12 @@ def test_policy_files(policy: CameraPolicy, tmp_path: Path):
     world = {"sim": {"pad_friction": (0.8, 0.8)}, "sensor": {"grey": 0.5}}
     for options, changes in (([], {}), (asked, {"policy": changed, **world})):
         copy.unlink(missing_ok=True)
-        assert cli.main(["export", "shipped", str(copy), *options]) == 0
+        assert cli.main(["export", "shipped_clutter", str(copy), *options]) == 0
         cfg, params = policy_file.load(copy)
         assert cfg == policy.cfg.change(**changes)
         jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
     policy_file.save(copy, jax.tree.map(lambda leaf: 3.0 * leaf, params), cfg.change(seed=7))
-    assert cli.main(["export", "shipped", str(mean), "--average", str(copy)]) == 0
+    assert cli.main(["export", "shipped_clutter", str(mean), "--average", str(copy)]) == 0
     cfg, averaged = policy_file.load(mean)
     assert cfg == policy.cfg
     jax.tree.map(lambda m, one: np.testing.assert_array_equal(m, 2.0 * one), averaged, params)

@@ -25,7 +25,7 @@ WORKSPACE = np.array([[0, -1, 0, 0.4], [1, 0, 0, -0.2], [0, 0, 1, 0.05], [0, 0, 
 
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
-    return CameraPolicy.load("shipped", WORKSPACE)
+    return CameraPolicy.load("shipped_clutter", WORKSPACE)
 
 
 def _untrained(**sections: Any) -> CameraPolicy:
@@ -87,7 +87,7 @@ def test_width_is_the_simulated_opening(policy: CameraPolicy):
 def test_decides_as_in_simulation(decisions: list[Decision]):
     """Claim: the first decision is the simulated policy's in the observation of the same camera."""
     eye = camera.make(CameraConfig())
-    trained = csac_jax.load_policy("shipped")
+    trained = csac_jax.load_policy("shipped_clutter")
     marks = np.ones(len(POSES), bool)
 
     @jax.jit
@@ -197,10 +197,10 @@ def test_misfit_is_refused(policy: CameraPolicy):
 
 def test_robot_may_have_another_gripper(decisions: list[Decision]):
     """Claim: a policy decides for the gripper that it is given, by default for its own."""
-    other = CameraPolicy.load("shipped", gripper="2f85").decide(*IMAGE)[0]
+    other = CameraPolicy.load("shipped_clutter", gripper="2f85").decide(*IMAGE)[0]
     assert (decisions[0].width, other.width) == pytest.approx((0.11, 0.085))
     with pytest.raises(SettingsError, match="neither one of"):
-        CameraPolicy.load("shipped", gripper="2f86")
+        CameraPolicy.load("shipped_clutter", gripper="2f86")
 
 
 def test_net_of_heights_sees_no_colours():

@@ -72,14 +72,14 @@ class Server:
 
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
-    loaded = CameraPolicy.load("shipped")
+    loaded = CameraPolicy.load("shipped_clutter")
     loaded.warm_up(640, 480, decider.batches())
     return loaded
 
 
 @pytest.fixture(scope="module", name="server")
 def _server(policy: CameraPolicy) -> Iterator[Server]:
-    running = Server(service.make(policy, "shipped", TOKEN))
+    running = Server(service.make(policy, "shipped_clutter", TOKEN))
     yield running
     running.stop()
 
@@ -87,7 +87,9 @@ def _server(policy: CameraPolicy) -> Iterator[Server]:
 @pytest.fixture
 def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Server]:
     """Starts a service that records into the test's folder."""
-    running = Server(service.make(policy, "shipped", TOKEN, Recorder(tmp_path, "shipped")))
+    running = Server(
+        service.make(policy, "shipped_clutter", TOKEN, Recorder(tmp_path, "shipped_clutter"))
+    )
     yield running
     running.stop()
 
@@ -171,7 +173,7 @@ def test_health_and_version(server: Server):
     """Claim: /health needs no token; /version names policy and versions."""
     assert server.ask("GET", "/health", token="") == (200, {"status": "ok"})
     status, answer = server.ask("GET", "/version")
-    assert (status, answer["policy"]) == (200, "shipped")
+    assert (status, answer["policy"]) == (200, "shipped_clutter")
     assert {"python", "jax", "csac-jax"} <= set(answer["versions"])
 
 

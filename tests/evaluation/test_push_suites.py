@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from csac_jax import grippers, presets
-from csac_jax.agent import maps
+from csac_jax.agent import actor_critic, maps
 from csac_jax.constants import Primitive
 from csac_jax.env import Env
 from csac_jax.errors import SceneError
@@ -121,14 +121,13 @@ def test_every_policy_searches_for_a_hidden_target():
     every = state.obs.replace(target=jnp.ones_like(state.obs.target))
     np.testing.assert_array_equal(valid, np.asarray(maps.actionable_cells(frames, every)))
     assert valid[Primitive.GRASP].any()
-    learned = policies.make("learned", "shipped_target")
+    learner = actor_critic.make(env.cfg)
+    params = jax.jit(lambda: actor_critic.init(jax.random.key(0), learner).online)()
     acting = {
         "random": policies.RandomPolicy(env.cfg),
         "oracle": policies.OraclePolicy(env.cfg),
         "geometric": policies.GeometricPolicy(env.cfg),
-        "learned": policies.in_world(
-            learned, learned.cfg.change(scene=env.cfg.scene, sim={"physics": "c"})
-        ),
+        "learned": policies.NetworkPolicy(env.cfg, params),
     }
     step, key = jax.jit(env.step), jax.random.key(3)
     for name, policy in acting.items():

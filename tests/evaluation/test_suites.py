@@ -61,7 +61,10 @@ def test_worlds_of_training_become_one():
     exact view from above; one of a single world keeps it, and so does `in_distribution`."""
     grip = {"pad_friction": (0.5, 1.2), "grip_force": (20.0, 70.0)}
     many = CFG.change(
-        sim={"gripper": "varied", **grip}, heightmap={"view": "both"}, sensor={"grey": 0.3}
+        sim={"gripper": "varied", **grip},
+        heightmap={"view": "both"},
+        sensor={"grey": 0.3},
+        scene={"certified": ("blocked",)},
     )
     assert suites.standard(many, "random10") == CFG
     assert suites.standard(many, suites.IN_DISTRIBUTION) == many

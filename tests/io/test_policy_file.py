@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from csac_jax import deploy, grippers, presets
+from csac_jax import api, cli, deploy, grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.agent.actor_critic import Params
+from csac_jax.config import SimConfig
 from csac_jax.deploy import decision
-from csac_jax.errors import DataWarning
+from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.io import configs, policy_file
 from csac_jax.io.policy_file import PolicyFileError
 from csac_jax.robot.primitives import Action
@@ -197,7 +198,7 @@ def test_damage_is_seen(tmp_path: Path, params: Params):
 
 def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch):
     """Claim: a shipped policy that was replaced, by a sound file even, is refused."""
-    path = tmp_path / "clear.safetensors"
+    path = tmp_path / "shipped.safetensors"
     policy_file.save(path, params, CFG)
     policy_file.load(path)
     monkeypatch.setitem(policy_file._SHA256, path, policy_file._SHA256[policy_file.find("shipped")])
@@ -207,28 +208,43 @@ def test_shipped_policy_is_checked(tmp_path: Path, params: Params, monkeypatch: 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
-    ("name", "preset", "task", "view", "gripper"),
-    [
-        ("shipped", "fast", "clear", "ortho", "rg2"),
-        ("shipped_camera", "fast", "clear", "oblique", "rg2"),
-        ("shipped_general", "general", "both", "ortho", "varied"),
-        ("shipped_clutter", "fast", "clear", "ortho", "rg2"),
-        ("shipped_grippers", "fast", "clear", "ortho", "varied"),
-        ("shipped_objects", "objects", "clear", "ortho", "rg2"),
-        ("shipped_target", "objects_target", "target", "ortho", "rg2"),
-    ],
+    ("name", "preset", "task"),
+    [("shipped", "general", "both"), ("shipped_clutter", "fast", "clear")],
 )
-def test_shipped_policy(name: str, preset: str, task: str, view: str, gripper: str):
+def test_shipped_policy(name: str, preset: str, task: str):
     """Claim: a policy that comes with the package is at most 5 MB, what its digest says, and of
-    this version; no version of JAX is warned of. Each is named here and in docs/policies.md."""
+    this version; no version of JAX is warned of. `shipped` knows any hand; without another one both
+    act with the RG2. Each is named here and in docs/policies.md."""
     path = policy_file.find(name)
     assert path.stat().st_size <= 5e6
     cfg, params = policy_file.load(path)
     assert (cfg.preset, cfg.task.kind, cfg.net.kind) == (preset, task, "small")
-    assert (cfg.heightmap.view, cfg.sim.gripper) == (view, gripper)
-    assert cfg.net.gripper == (gripper == "varied")
+    assert cfg.sim.gripper == SimConfig.gripper
+    assert cfg.net.gripper == (name == "shipped")
+    assert len(policy_file.SHIPPED) == 2
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
     assert f"`{name}`" in PAGE.read_text()
+
+
+@pytest.mark.parametrize("name", ["camera", "general", "grippers", "objects", "target"])
+def test_policies_of_earlier_versions(name: str, capsys: pytest.CaptureFixture):
+    """Claim: a policy that has left the package answers with one line, exit code 2, wherever a
+    policy is asked for; the line names `shipped`, with --sim.gripper for another hand."""
+    source = f"shipped_{name}"
+    asked = {"grippers": "--sim.gripper", "target": "mask"}.get(name, "use shipped")
+    with pytest.raises(SettingsError, match=f"^{source} ships no more; use shipped.*"):
+        api.load_policy(source)
+    files = "--rgb a.png --depth a.png --intrinsics a.json --pose a.json"
+    for command in (
+        "eval {}",
+        "play --policy {}+planner",
+        "train fast --init {}",
+        f"act {{}} {files}",
+    ):
+        assert cli.main(command.format(source).split()) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"csac-jax: {source} ships no more; use shipped")
+        assert asked in line
 
 
 def test_old_file_without_digest_loads_with_a_warning(tmp_path: Path, params: Params):

@@ -10,6 +10,7 @@ from csac_jax import cli
 from csac_jax.evaluation import metrics
 from csac_jax.io import configs, files, policy_file, seal
 from csac_jax.report import model_card, results
+from experiments import card
 
 CFG, _ = policy_file.load(policy_file.SHIPPED["shipped"])
 
@@ -44,7 +45,7 @@ def test_card_has_what_hubs_read(tmp_path: Path):
     scores = {one["type"]: one["value"] for one in found["random10"]["metrics"]}
     assert scores == {"grasp_success": 0.9, "completion": 0.9, "action_efficiency": 0.9}
     assert hashlib.sha256(file.read_bytes()).hexdigest() in body
-    assert "`csac-jax train fast --algo csac_beta --seed 0" in body
+    assert "`csac-jax train general --algo csac_beta --seed 1" in body
     assert "| cases, hole | mine | 10 | 40.0 %" in body
 
 
@@ -60,6 +61,17 @@ def test_card_has_the_time_of_its_run(tmp_path: Path):
         evaluated = model_card.read([tmp_path / "random10.json"])
         text = model_card.write(file, CFG, evaluated, found).read_text()
         assert row in text if row else "| time |" not in text
+
+
+def test_shipped_policy_has_its_card():
+    """Claim: the card beside `shipped` is as written from the records, and names the digest of the
+    file, its time, and the suites that docs/results.md has."""
+    text = card.CARD.read_text()
+    assert text == card.text()
+    assert policy_file._DIGESTS["shipped"] in text
+    assert "| time | 752 s on one NVIDIA H200 |" in text
+    for suite in ("random10", "pile", "enclosed"):
+        assert f"| {suite} | shipped |" in text
 
 
 @pytest.mark.parametrize("fault", ["none", "there"])
