@@ -266,7 +266,8 @@ def initial_networks(cfg: Config, source: str | Path | None) -> Callable[[Any], 
 
 
 def match_networks(cfg: Config, source: str | Path) -> Config:
-    """Gives a config networks of the sizes of the policy `source`, see `train`'s `init`."""
+    """Gives a config networks of the sizes of the policy `source`, see `train`'s `init`, and maps
+    of as many cells, since kernels have the scale of a cell."""
     if _is_weights(source):
         return cfg
     stored = policies.load_config(source)
@@ -275,7 +276,7 @@ def match_networks(cfg: Config, source: str | Path) -> Config:
     if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet):
         mask = net.mask or (stored.sees_mask and not cfg.task.has_target)
         net = dataclasses.replace(net, gripper=net.gripper or cfg.net.gripper, mask=mask)
-    return cfg.change(net=net, learn=learn)
+    return cfg.change(net=net, learn=learn, heightmap={"size": stored.heightmap.size})
 
 
 def new_folder(name: str) -> Path:

@@ -167,30 +167,32 @@ def shipped() -> list[str]:
     return sorted(path.parent.name for path in assets().glob(f"grippers/*/{NUMBERS}"))
 
 
-def load(source: "str | Gripper") -> Gripper:
+def load(source: "str | Gripper", setting: str = "sim.gripper") -> Gripper:
     """Returns the gripper of a name or a folder, which is read at each call; a gripper as it is.
 
-    Raises SettingsError for a source that is no gripper, and for numbers that are wrong.
+    Raises SettingsError, which names `setting`, for a source that is no gripper, and for numbers
+    that are wrong.
     """
     if isinstance(source, Gripper):
         return source
-    return _shipped(source) if source in shipped() else _from_folder(Path(source))
+    return _shipped(source) if source in shipped() else _from_folder(Path(source), setting)
 
 
-def resolve(source: "str | Gripper") -> "str | Gripper":
-    """Replaces the folder of a gripper by the gripper, so that it travels with its config."""
-    return source if source in shipped() else load(source)
+def resolve(source: "str | Gripper", setting: str = "sim.gripper") -> "str | Gripper":
+    """Replaces the folder of a gripper by the gripper, so that it travels with its config; see
+    `load`."""
+    return source if source in shipped() else load(source, setting)
 
 
 @functools.lru_cache
 def _shipped(name: str) -> Gripper:
-    return _from_folder(assets() / "grippers" / name)
+    return _from_folder(assets() / "grippers" / name, "sim.gripper")
 
 
-def _from_folder(folder: Path) -> Gripper:
+def _from_folder(folder: Path, setting: str) -> Gripper:
     path = folder / NUMBERS
     if not path.is_file():
-        neither = f"sim.gripper: '{folder}' is neither one of {', '.join(shipped())}"
+        neither = f"{setting}: '{folder}' is neither one of {', '.join(shipped())}"
         raise SettingsError(f"{neither} nor a folder with a {NUMBERS}")
     try:
         return _from_json(folder, reading.read_bytes(path, LARGEST))

@@ -1,5 +1,9 @@
-"""Draws the pictures of README and docs into docs/pictures: `python -m experiments.pictures`."""
+"""Draws the pictures of README and docs into docs/pictures: `python -m experiments.pictures`.
 
+`python -m experiments.pictures freeing` draws one of them alone.
+"""
+
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -40,13 +44,15 @@ FRAME_MS = 80  # of the animation
 END_MS = 900  # of an action's last picture, in which its outcome is read
 
 
-def main() -> None:
-    """Draws them all."""
+def main(chosen: list[str]) -> None:
+    """Draws the chosen pictures, or all."""
     cache.enable()
-    for name in cases.names():
-        media.write_picture(FOLDER / f"{name}.png", still(name))
-    write_animation(FOLDER / "freeing.webp", list(freeing()))
-    write_animation(FOLDER / "clearing.webp", [*pinwheel(), *pile()])
+    animations = {"freeing": freeing, "clearing": clearing}
+    for name in chosen or (*cases.names(), *animations):
+        if name in animations:
+            write_animation(FOLDER / f"{name}.webp", list(animations[name]()))
+        else:
+            media.write_picture(FOLDER / f"{name}.png", still(name))
 
 
 def still(name: str) -> np.ndarray:
@@ -107,17 +113,23 @@ def freeing() -> Iterator[tuple[np.ndarray, int]]:
             yield from ((stage.draw(pose), FRAME_MS) for pose in moves)
 
 
+def clearing() -> Iterator[tuple[np.ndarray, int]]:
+    """Yields pictures and times, ms: the pinwheel, then the pile."""
+    yield from pinwheel()
+    yield from pile()
+
+
 def pinwheel() -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures and times, ms: `shipped` takes the pinwheel apart."""
-    return moving("shipped", str(cases.shipped("pinwheel")), PINWHEEL, every=2)
+    return in_motion("shipped", str(cases.shipped("pinwheel")), PINWHEEL, every=2)
 
 
 def pile() -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures and times, ms: `shipped_clutter` clears thirty blocks."""
-    return moving("shipped_clutter", "random30", PILE, every=4, hold=3 * FRAME_MS)
+    return in_motion("shipped_clutter", "random30", PILE, every=4, hold=3 * FRAME_MS)
 
 
-def moving(
+def in_motion(
     source: str, suite: str, seed: int, every: int, hold: int = END_MS
 ) -> Iterator[tuple[np.ndarray, int]]:
     """Yields pictures [H, W, 3] uint8 of an episode and times, ms; `hold` for a motion's end."""
@@ -148,4 +160,4 @@ def write_animation(path: Path, pictures: list[tuple[np.ndarray, int]]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

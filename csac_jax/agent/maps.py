@@ -99,26 +99,28 @@ def _cells(rotations: int, side: int, cell: float) -> tuple[np.ndarray, np.ndarr
 def _reachable(
     sim: SimConfig, heightmap: HeightmapConfig, rotations: int, side: int, cell: float
 ) -> np.ndarray:
-    """Computes the cells where the robot can act, [P, K, h, w] bool."""
+    """Computes the cells of the workspace where the robot can act, [P, K, h, w] bool."""
     xy, yaws = _cells(rotations, side, cell)
     if sim.robot == "hand":
         return np.ones((len(Primitive), *xy.shape[:3]), bool)
+    inside = np.all(np.abs(xy) <= 0.5 * heightmap.extent, axis=-1)
+    turned = np.broadcast_to(yaws[:, None, None, None], (*inside.shape, 1))
+    poses = np.concatenate([xy, turned], axis=-1)[inside]
+    rows = np.resize(poses, (-(-len(poses) // side), side, 3))  # the last one is filled up
     with jax.ensure_compile_time_eval():
-        rows = np.asarray(jax.jit(functools.partial(reach_of_rows, sim, heightmap))(xy, yaws))
-    return np.moveaxis(rows, 1, 0).reshape(len(Primitive), *xy.shape[:3])
+        found = np.asarray(jax.jit(functools.partial(reach_of_rows, sim, heightmap))(rows))
+    reach = np.zeros((*inside.shape, len(Primitive)), bool)
+    reach[inside] = found.reshape(-1, len(Primitive))[: len(poses)]
+    return np.moveaxis(reach, -1, 0)
 
 
-def reach_of_rows(
-    sim: SimConfig, heightmap: HeightmapConfig, xy: jax.Array, yaws: jax.Array
-) -> jax.Array:
-    """Tells where the arm reaches both ends of an action, a row at a time: [K * h, P, w] bool.
+def reach_of_rows(sim: SimConfig, heightmap: HeightmapConfig, poses: jax.Array) -> jax.Array:
+    """Tells where the arm reaches both ends of an action, a row at a time: [R, w, P] bool.
 
-    All cells at once take gigabytes. Args: xy [K, h, w, 2] m; yaws [K] rad.
+    All at once take gigabytes. Args: poses [R, w, 3], x and y in m, yaw in rad.
     """
     reachable = functools.partial(primitives.reachable, sim, heightmap)
-    row = jax.vmap(jax.vmap(reachable, (None, 0, None)), (0, None, None))  # [P, w]
-    rows = jnp.concatenate(xy), jnp.repeat(yaws, xy.shape[1])
-    return jax.lax.map(lambda one: row(jnp.arange(len(Primitive)), *one), rows)
+    return jax.lax.map(jax.vmap(lambda pose: reachable(pose[:2], pose[2])), poses)
 
 
 @struct.dataclass

@@ -62,10 +62,9 @@ def grasp(
     values, cells = jax.lax.top_k(allowed.reshape(-1), CANDIDATES)
     xy = jnp.asarray(places, jnp.float32).reshape(-1, 2)[cells]
     yaw = jnp.asarray(yaws, jnp.float32)[cells // maps[0].size]
-    kind = jnp.int32(Primitive.GRASP)
-    reached = jax.vmap(functools.partial(reachable, cfg.sim, cfg.heightmap, kind))(xy, yaw)
-    best = jnp.argmax(jnp.where(reached, values, -jnp.inf))
-    return Action(primitive=kind, pose=jnp.append(xy[best], yaw[best]))
+    reached = jax.vmap(functools.partial(reachable, cfg.sim, cfg.heightmap))(xy, yaw)
+    best = jnp.argmax(jnp.where(reached[:, Primitive.GRASP], values, -jnp.inf))
+    return Action(primitive=jnp.int32(Primitive.GRASP), pose=jnp.append(xy[best], yaw[best]))
 
 
 def _places(cfg: Config, yaws: np.ndarray) -> np.ndarray:

@@ -118,7 +118,7 @@ def _candidates(
     fingers = scene_state.fingers(scene, gripper)
     inner = 0.5 * jnp.asarray(fingers.opening)  # m, to an open finger
     along, across_pad = fingers.footprint
-    slots, kind = jnp.arange(len(cfg.scene.slots)), jnp.int32(Primitive.GRASP)
+    slots = jnp.arange(len(cfg.scene.slots))
 
     def place(target: GraspTarget, yaw: Array, shift: Array) -> Array:
         across = rotate2d(yaw, jnp.array([0.0, 1.0]))
@@ -155,7 +155,8 @@ def _candidates(
         away = jnp.linalg.norm(centre - scene.position[scene.target, :2])
         asked = jnp.where(scene.target == target.slot, 3.0, -4.0 * away)
         wanted = jnp.where(scene.target == ANY, 5.0 * scene.position[target.slot, 2], asked)
-        possible = scene.in_play[target.slot] & reachable(sim, cfg.heightmap, kind, centre, yaw)
+        reached = reachable(sim, cfg.heightmap, centre, yaw)[Primitive.GRASP]
+        possible = scene.in_play[target.slot] & reached
         return jnp.where(possible, wanted - cost, -jnp.inf)
 
     def of_target(target: GraspTarget) -> GraspCandidates:

@@ -65,7 +65,7 @@ USAGE = f"""usage: {PROGRAM} COMMAND ...
 
 A robot learns to push and grasp in clutter.
 
-  demo               write a video of an arm that pushes a block free, in about a minute
+  demo               write a video of an arm that pushes blocks apart, in a minute or two
   train PRESET       train with a preset: {", ".join(presets.PRESETS)}
                      --algo NAME: {", ".join(algorithms.ALGORITHMS)}
   train --resume DIR continue a run that was stopped

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from csac_jax.cli import output, parsing
-from csac_jax.cli.robot_options import RobotOptions
+from csac_jax.cli.robot_options import RobotOptions, naming_the_option
 from csac_jax.errors import FailedError
 from csac_jax.section import require
 
@@ -35,6 +35,7 @@ class ActOptions(RobotOptions):
     """File to write a picture to: the image with the actions drawn in it, and the Q maps."""
 
 
+@naming_the_option()
 def run(arguments: list[str]) -> int:
     """Decides and prints; returns the exit code."""
     options = parsing.parse(ActOptions, arguments, "act")

@@ -288,22 +288,26 @@ def _print_objects(objects: dict[str, Any]) -> None:
 
 
 def print_summary(title: str, summary: dict[str, Any]) -> None:
-    """Prints every metric, and a dash for one without cases."""
+    """Prints every metric, and a dash for one without cases. A suite of objects has no word of
+    blocks."""
     from rich.console import Console
     from rich.table import Table
 
     from csac_jax.evaluation.statistics import Band
     from csac_jax.report import cells
 
-    caption = "in brackets: 95 % interval; action_efficiency: blocks per action"
+    thing = "object" if "objects" in summary else "block"
+    caption = f"in brackets: 95 % interval; action_efficiency: {thing}s per action"
     table = Table("metric", "value", "n", title=title, caption=caption)
     for name, entry in {**summary, **summary.get("failures", {})}.items():
         if isinstance(entry, dict) and "value" in entry:
             band = Band(**entry) if entry["n"] else None
-            table.add_row(name, cells.shown(metric=name, band=band), str(entry["n"]))
+            row = name.replace("block", thing)
+            table.add_row(row, cells.shown(metric=name, band=band), str(entry["n"]))
     console = Console(highlight=False)
     console.print(table)
     if "objects" in summary:
         _print_objects(summary["objects"])
     for name in ("outcomes", "counts"):
-        console.print(f"{name}:", ", ".join(f"{key} {n}" for key, n in summary[name].items()))
+        numbers = ", ".join(f"{key} {n}" for key, n in summary[name].items())
+        console.print(f"{name}:", numbers.replace("block", thing))

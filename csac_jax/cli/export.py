@@ -8,7 +8,7 @@ import tyro
 
 from csac_jax.cli import settings
 from csac_jax.cli.failures import check_extra
-from csac_jax.cli.robot_options import PolicyOptions, check_size
+from csac_jax.cli.robot_options import PolicyOptions, check_size, naming_the_option
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
 from csac_jax.section import require
@@ -48,6 +48,7 @@ class ExportOptions(PolicyOptions):
     """Width and height of that image, px."""
 
 
+@naming_the_option()
 def run(arguments: list[str]) -> int:
     """Writes the file; returns the exit code."""
     options, view = settings.parse_view(ExportOptions, "export", arguments)

@@ -10,7 +10,7 @@ import tyro
 
 from csac_jax.cli import output, parsing
 from csac_jax.cli.failures import check_seed
-from csac_jax.cli.robot_options import PolicyOptions
+from csac_jax.cli.robot_options import PolicyOptions, naming_the_option
 from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
 from csac_jax.section import require
@@ -39,6 +39,7 @@ class FinetuneOptions(PolicyOptions):
     """File to write the result to, as JSON."""
 
 
+@naming_the_option()
 def run(arguments: list[str]) -> int:
     """Learns, saves and prints; returns the exit code."""
     options = parsing.parse(FinetuneOptions, arguments, "finetune")

@@ -1,11 +1,14 @@
 """Options that commands at a real robot share."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import tyro
 
+from csac_jax.errors import SettingsError
 from csac_jax.section import require
 
 
@@ -47,6 +50,17 @@ class RobotOptions(PolicyOptions):
         from csac_jax.deploy.record import Recorder
 
         return None if self.record is None else Recorder(self.record, self.policy)
+
+
+@contextlib.contextmanager
+def naming_the_option() -> Iterator[None]:
+    """Puts the option's name into errors about the robot's gripper."""
+    try:
+        yield
+    except SettingsError as error:
+        if str(error).startswith("gripper:"):
+            raise SettingsError(f"--{error}") from None
+        raise
 
 
 def check_size(size: tuple[int, int]) -> None:

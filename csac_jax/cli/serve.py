@@ -8,7 +8,7 @@ import tyro
 
 from csac_jax.cli import parsing
 from csac_jax.cli.failures import check_extra
-from csac_jax.cli.robot_options import RobotOptions, check_size
+from csac_jax.cli.robot_options import RobotOptions, check_size, naming_the_option
 from csac_jax.section import require
 
 LOCAL = ("127.0.0.1", "::1", "localhost")
@@ -33,6 +33,7 @@ class ServeOptions(RobotOptions):
     Context Protocol (extra `mcp`)."""
 
 
+@naming_the_option()
 def run(arguments: list[str]) -> int:
     """Serves until it is stopped; returns the exit code."""
     options = parsing.parse(ServeOptions, arguments, "serve")

@@ -58,7 +58,8 @@ class SweepOptions:
     config: Path | None = None
     """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
     init: str | None = None
-    """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
+    """Start from the networks of a run, a policy file or `shipped`; brings its net settings
+    and its heightmap.size."""
     json: Path | None = None
     """File to write the result to, as JSON."""
     seed: int = 0

@@ -36,7 +36,8 @@ class TrainOptions:
     config: Path | None = None
     """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
     init: str | None = None
-    """Start from the networks of a run, a policy file or `shipped`; brings its net settings."""
+    """Start from the networks of a run, a policy file or `shipped`; brings its net settings
+    and its heightmap.size."""
     log: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ()
     """Trackers that get every number, each needs the extra of its name."""
     eval_every: int = 0

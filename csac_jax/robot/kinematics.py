@@ -258,12 +258,11 @@ def joint_targets(arm: Arm, q_start: Array, control: Array) -> tuple[Array, Arra
 
 
 def reaches(arm: Arm, tips: Array, yaw: Array) -> Array:
-    """Returns [] bool, the clear arm reaches all places `tips` [T, 3] m at `yaw` [] on one branch.
+    """Returns [T, 8] bool, branches by which the clear arm is at `tips` [T, 3] m, `yaw` [] rad.
 
     The hand points down. The way between the places is not checked.
     """
-    _, valid = _clear_branches(arm, tips, jnp.broadcast_to(yaw, len(tips)))
-    return jnp.any(jnp.all(valid, axis=0))
+    return _clear_branches(arm, tips, jnp.broadcast_to(yaw, len(tips)))[1]
 
 
 def _clear_branches(arm: Arm, tips: Array, yaw: Array) -> tuple[Array, Array]:

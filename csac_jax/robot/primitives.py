@@ -105,16 +105,17 @@ def plan(
     return Plan(control=control, start=jnp.hstack([start, high, yaw, opening]), surface=surface)
 
 
-def reachable(
-    cfg: SimConfig, heightmap: HeightmapConfig, primitive: Array, xy: Array, yaw: Array
-) -> Array:
-    """Returns [] bool, a primitive [] at `xy` [2] m is in reach, on the table and above a block."""
+def reachable(cfg: SimConfig, heightmap: HeightmapConfig, xy: Array, yaw: Array) -> Array:
+    """Returns [P] bool, the arm reaches each primitive at `xy` [2] m, on the table and above a
+    block, on one branch."""
     if cfg.robot == "hand":
-        return jnp.ones((), bool)
-    low, is_push = lowest(cfg, grippers.load(cfg.gripper)), primitive == Primitive.PUSH
-    ends = xy, jnp.where(is_push, _push_end(cfg, heightmap, xy, yaw), xy)
+        return jnp.ones(len(Primitive), bool)
+    low = lowest(cfg, grippers.load(cfg.gripper))
+    ends = xy, _push_end(cfg, heightmap, xy, yaw)
     tips = [jnp.append(end, z) for end in ends for z in (low, low + cfg.approach_height + BLOCK)]
-    return kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)
+    by_branch = kinematics.reaches(kinematics.arm(cfg), jnp.stack(tips), yaw)  # [4, 8]
+    needed = {Primitive.PUSH: by_branch, Primitive.GRASP: by_branch[:2]}
+    return jnp.stack([jnp.any(jnp.all(needed[p], axis=0)) for p in Primitive])
 
 
 def _push_end(cfg: SimConfig, heightmap: HeightmapConfig, xy: Array, yaw: Array) -> Array:

@@ -160,6 +160,8 @@ LENS = "--rgb a.png --intrinsics c.json"
     [
         ("act shipped {} --top 0", "top: must lie in 1 .. 64, not 0"),
         ("act shipped {} --png out.bmp", "its name must end in one of: .png"),
+        ("act shipped {} --gripper frank", "csac-jax: --gripper: 'frank' is neither one of 2f85, "),
+        ("act shipped {} --gripper varied", "csac-jax: --gripper: name the robot's, one of 2f85, "),
         ("act shipped {} --check --record r", "--record: --check decides nothing"),
         ("act shipped {} --record .", "is no record: it has no record.json"),
         ("serve shipped --host 0.0.0.0", "give --token-file too"),

@@ -193,10 +193,13 @@ def test_nothing_to_start_from(
 
 
 def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
-    """Claim: --init brings the settings of its networks; others given as options are refused."""
+    """Claim: --init brings the settings of its networks, and as many cells as they learned with,
+    unless options say otherwise; other networks given as options are refused."""
     cfg = train.read(["smoke", "--init", "shipped_clutter"])[1]
     assert cfg.net == policies.load_config("shipped_clutter").net
     assert cfg.learn.batch == SMOKE.learn.batch
+    for flags, size in (([], 96), (["--heightmap.size", "64"], 64)):
+        assert train.read(["smoke", "--init", "shipped", *flags])[1].heightmap.size == size
     message = "its networks are not those of these settings"
     _fails(capsys, 2, "train fast --init shipped_clutter --net.growth 8", message)
 

@@ -160,6 +160,18 @@ def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
     assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
 
 
+def test_blocks_are_called_objects_where_they_are(capsys: pytest.CaptureFixture):
+    """Claim: the printed table of a suite of objects has no word of blocks; that of blocks does."""
+    share = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 10}
+    summary = {"block_lost": share, "outcomes": {}, "counts": {"blocks": 9, "blocks_lost": 1}}
+    for objects, thing, other in (({"objects": {}}, "object", "block"), ({}, "block", "object")):
+        evaluate.print_summary("pile", summary | objects)
+        printed = " ".join(capsys.readouterr().out.split())
+        assert all(f"{thing}{end}" in printed for end in ("_lost │ 50.0 %", "s 9, ", "s_lost 1"))
+        assert f"{thing}s per action" in printed
+        assert other not in printed
+
+
 @pytest.mark.mjx
 @pytest.mark.slow
 def test_a_suite_is_the_evaluation(tmp_path: Path):
