@@ -447,7 +447,7 @@ class TrainConfig(Section, section="train"):
     learning_starts: int = number(64, 1)  # Actions before the first update.
     chunk: int = number(10, 1, 2**20)  # Training steps per compiled call; logs come between calls.
     save_every: int = number(50, 1)  # Chunks per checkpoint; the last and a stop always save.
-    overlap: bool = False  # Learn while Warp moves the robot, from the transitions before.
+    overlap: bool = False  # Learn while Warp moves, from transitions before (for one GPU).
 
     @property
     def steps(self) -> int:

@@ -23,8 +23,8 @@ STORED = Path(__file__).parent / "formats" / "format-2.json"
 SAVED = presets.quick().change(  # as it was when that file was written
     net={"growth": 32, "rotations": 16},
     policy={"augment": False},
-    explore={"epsilon_decay": 0.998},
-    learn={"updates_per_step": 2, "learning_rate": 1e-3},
+    explore={"epsilon_place": (0.5, 0.0), "epsilon_decay": 0.998},
+    learn={"updates_per_step": 2, "learning_rate": 1e-3, "augment_shift": 0},
 )
 
 
