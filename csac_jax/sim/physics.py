@@ -77,7 +77,7 @@ class Started(NamedTuple):
     plan: Plan
     reachable: jax.Array  # [] bool, the robot can follow
     valid: jax.Array | bool  # [] bool, see `act`
-    running: Any  # what `finish` gets the result from: of Warp a token, else the result
+    running: Any  # of Warp a token of the result, else the result
 
 
 def start(
@@ -86,18 +86,16 @@ def start(
     scene: SceneState,
     height: jax.Array,
     action: Action,
-    valid: jax.Array | bool = True,
+    valid: jax.Array | bool,
 ) -> Started:
-    """Starts a primitive over the map `height` [H, W] m, see `act`. Warp runs it in the background:
-    `finish` it before another of as many scenes starts."""
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
-    joints = primitives.joint_trajectory(cfg.sim, plan)
-    begin = physics.start if isinstance(physics, warp_physics.WarpPhysics) else physics.run
-    return Started(scene, action, plan, joints.reachable, valid, begin(scene, joints))
+    """Starts a primitive, see `act`. Warp runs it in the background: `finish` it before another one
+    of as many scenes starts."""
+    run = physics.start if isinstance(physics, warp_physics.WarpPhysics) else physics.run
+    return _started(run, cfg, scene, height, action, valid)
 
 
 def finish(physics: Physics, cfg: Config, started: Started, after: jax.Array) -> Motion:
-    """Waits for a primitive; Warp runs until `after` [] was computed."""
+    """Waits for a primitive once `after` [] was computed; until then Warp runs beside that."""
     result = started.running
     if isinstance(physics, warp_physics.WarpPhysics):
         result = physics.finish(started.scene, result, after)
@@ -108,9 +106,8 @@ def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
     """Runs a primitive over the map `height` [H, W] m; nothing moves if the robot cannot follow."""
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
-    joints = primitives.joint_trajectory(cfg.sim, plan)
-    return _followed(scene, plan, joints.reachable, *physics.run(scene, joints))
+    started = _started(physics.run, cfg, scene, height, action, True)
+    return _followed(started, *started.running)
 
 
 def act(
@@ -123,26 +120,36 @@ def act(
 ) -> Motion:
     """Runs a primitive, as `execute`, and takes lifted and lost blocks off the table. Undoes one
     that is not `valid` [] bool, that diverges or that is blocked."""
+    started = _started(physics.run, cfg, scene, height, action, valid)
+    return _judged(cfg, started, *started.running)
+
+
+def _started(
+    run: Callable[[SceneState, JointTrajectory], Any],
+    cfg: Config,
+    scene: SceneState,
+    height: jax.Array,
+    action: Action,
+    valid: jax.Array | bool,
+) -> Started:
     plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
     joints = primitives.joint_trajectory(cfg.sim, plan)
-    started = Started(scene, action, plan, joints.reachable, valid, None)
-    return _judged(cfg, started, *physics.run(scene, joints))
+    return Started(scene, action, plan, joints.reachable, valid, run(scene, joints))
 
 
-def _followed(
-    scene: SceneState, plan: Plan, reachable: jax.Array, after: SceneState, trace: Trace
-) -> tuple[SceneState, Trace, Plan]:
+def _followed(started: Started, after: SceneState, trace: Trace) -> tuple[SceneState, Trace, Plan]:
     """Returns the scene as it was where the robot cannot follow."""
+    scene, plan = started.scene, started.plan
     unmoved = scene_state.park(scene, scene.in_play), jax.tree.map(jnp.zeros_like, trace)
-    choose = functools.partial(jnp.where, reachable)
+    choose = functools.partial(jnp.where, started.reachable)
     after, trace = jax.tree.map(choose, (after, trace), unmoved)
     return after, trace, plan.replace(surface=choose(plan.surface, 0.0))
 
 
 def _judged(cfg: Config, started: Started, after: SceneState, trace: Trace) -> Motion:
-    """Takes lifted and lost blocks off the table, undoes what `act` says."""
-    scene, action, plan, reachable, valid, _ = started
-    after, trace, plan = _followed(scene, plan, reachable, after, trace)
+    """Takes lifted and lost blocks off the table, and undoes what `act` names."""
+    scene, action, valid = started.scene, started.action, started.valid
+    after, trace, plan = _followed(started, after, trace)
     finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
     diverged = ~(valid & finite & healthy(after))
     guarded = cfg.sim.approach == "guarded"

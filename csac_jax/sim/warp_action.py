@@ -226,7 +226,7 @@ class Batch:
         self._advance = self.recorded(self.substep)
         if wp.get_device().is_cuda:
             self._stream = wp.Stream(priority=-1)  # before others: few blocks of threads each
-            self._given, self._moved = wp.Event(), wp.Event()
+            self._taken, self._ended = wp.Event(), wp.Event()
 
     def run(self, inputs: Sequence[wp.array], outputs: Sequence[wp.array]) -> None:
         """Runs one primitive; arrays in the order of a simulator's arguments and results."""
@@ -237,15 +237,15 @@ class Batch:
     def start(self, inputs: Sequence[wp.array]) -> None:
         """Starts one primitive on a stream of its own."""
         self._take(inputs)
-        wp.record_event(self._given)
+        wp.record_event(self._taken)
         with wp.ScopedStream(self._stream, sync_enter=False):
-            wp.wait_event(self._given)
+            wp.wait_event(self._taken)
             self._advance()
-            wp.record_event(self._moved)
+            wp.record_event(self._ended)
 
     def finish(self, outputs: Sequence[wp.array]) -> None:
         """Makes the current stream wait for the primitive that was started last."""
-        wp.wait_event(self._moved)
+        wp.wait_event(self._ended)
         self._give(outputs)
 
     def _take(self, inputs: Sequence[wp.array]) -> None:
