@@ -28,7 +28,7 @@ MAIN = {
 """Benchmark -> its arguments."""
 PARTS = ("first_action", "first_action_cached", "success", "end")  # of `start`
 FIGURES = {
-    "step": ("actions_per_second", "step_seconds", "compile_seconds.cached.compile"),
+    "step": ("actions_per_second", "step_seconds"),
     "start": tuple(f"median.this.{part}" for part in PARTS),
     "learner": ("peak_gflop_per_second", "parts.forward.share_of_peak"),
     "act": ("densenet121.0.seconds_per_state", "small.quick.times.0.seconds_per_state"),
