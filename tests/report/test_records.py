@@ -109,7 +109,7 @@ def test_links_lead_somewhere():
 
 
 def test_records_that_pages_name_exist():
-    """Claim: each benchmark's record that README and docs name, as `bench/act.json`, `cpu`, is
+    """Claim: each benchmark's record that README and docs name, as `bench/decide.json`, `cpu`, is
     there; so is each folder of runs, as `fast/csac_beta`."""
     text = "\n".join(page.read_text() for page in PAGES)
     pattern = r"`(bench/\w+\.json)`(?:, `([\w*/.-]+)`)?(?: and `([\w-]+)`)?"
