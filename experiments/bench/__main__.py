@@ -18,7 +18,7 @@ BUILD = Path(__file__).resolve().parents[2] / "build"
 MAIN = {
     "step": ["quick"],
     "start": ["quick", "--runs", "1"],
-    "replay": ["12", "16"],
+    "replay": ["--largest", "16"],
     "sweep": ["quick", "--seeds", "1", "4"],
     "objects": [],
     "parity": ["--primitives", "64", "--poses", "8"],

@@ -452,7 +452,8 @@ def test_benchmark_is_run_with_its_arguments(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "arguments", ["start smoke --runs 1 --cores 1", "replay 6 7", "step smoke --repeats 1"]
+    "arguments",
+    ["start smoke --runs 1", "replay --smallest 6 --largest 7", "step smoke --repeats 1"],
 )
 def test_benchmarks_run(capfd: pytest.CaptureFixture, arguments: str):
     """Claim: the benchmarks print JSON with times and provenance."""
