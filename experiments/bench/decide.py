@@ -29,10 +29,8 @@ def image() -> tuple[Any, ...]:
     """Draws the image of a camera: colour, depth, intrinsics and pose."""
     with tempfile.TemporaryDirectory() as folder:
         camera_image.main(folder)
-        at = Path(folder)
-        rgb, depth = image_files.read_rgb(at / "rgb.png"), image_files.read_depth(at / "depth.png")
-        lens = image_files.read_intrinsics(at / "intrinsics.json")
-        return rgb, depth, lens, image_files.read_pose(at / "pose.json")
+        names = ("rgb.png", "depth.png", "intrinsics.json", "pose.json")
+        return image_files.read_image(*(Path(folder, name) for name in names))
 
 
 def measure(repeats: int) -> dict[str, Any]:
