@@ -130,7 +130,7 @@ def test_pads_in_mujoco(fingers: Fingers):
     joints = jax.jit(functools.partial(primitives.joint_trajectory, CONFIG.sim))(plan)
     data.qpos[world.robot_qpos] = joints.start
     mujoco.mj_kinematics(own, data)
-    low, high = world.hand_geoms[1:]
+    low, high = world.pads
     apart = np.linalg.norm((data.geom_xpos[high] - data.geom_xpos[low])[:2])
     np.testing.assert_allclose(apart - fingers.thickness, fingers.opening, atol=1e-6)
     for pad in (low, high):
@@ -173,8 +173,8 @@ def test_other_physics_have_the_same_pads(physics: PhysicsKind):
         from csac_jax.sim import warp_physics
 
         found = warp_physics._model_fields(world, scene)
-        bounds = found["geom_aabb"][world.hand_geoms[1:]]
-        np.testing.assert_allclose(bounds[:, 1], wanted.geom_size[world.hand_geoms[1:]], rtol=1e-6)
+        bounds = found["geom_aabb"][world.pads]
+        np.testing.assert_allclose(bounds[:, 1], wanted.geom_size[world.pads], rtol=1e-6)
     for name in ("geom_size", "geom_pos", "geom_rbound"):
         np.testing.assert_allclose(found[name], getattr(wanted, name), rtol=1e-6, err_msg=name)
 

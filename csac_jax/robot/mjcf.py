@@ -45,10 +45,27 @@ FLOAT = (  # ours
 )
 
 
-def hand_geoms(gripper: Gripper) -> tuple[str, str, str]:
-    """Returns the names in the model of palm, low pad and high pad."""
+def pads(gripper: Gripper) -> tuple[str, str]:
+    """Returns the names in the model of low pad and high pad."""
     low, high = gripper.pads
-    return PREFIX + gripper.palm, PREFIX + low, PREFIX + high
+    return PREFIX + low, PREFIX + high
+
+
+def hand_geoms(spec: mujoco.MjSpec, gripper: Gripper) -> tuple[list[str], list[str], list[str]]:
+    """Returns the names in the model of the palm, of the low finger's geoms and of the high one's.
+
+    A finger is all below the hand's root that moves with its pad, which comes first.
+    """
+    low, high = (_finger(spec, pad, PREFIX + gripper.body) for pad in pads(gripper))
+    return [PREFIX + gripper.palm], low, high
+
+
+def _finger(spec: mujoco.MjSpec, pad: str, root: str) -> list[str]:
+    body = spec.geom(pad).parent
+    while body.parent.name != root:
+        body = body.parent
+    names = [geom.name for geom in body.find_all("geom") if geom.contype or geom.conaffinity]
+    return sorted(names, key=lambda name: name != pad)
 
 
 def joint_names(sim: SimConfig, gripper: Gripper) -> list[str]:
@@ -66,6 +83,8 @@ def add(spec: mujoco.MjSpec, sim: SimConfig, gripper: Gripper) -> None:
     for geom in tool.geoms:
         if tuple(geom.solimp[:2]) == _MUJOCO_IMPEDANCE:
             geom.solimp[:2] = _GRIPPER_IMPEDANCE
+    for number, geom in enumerate(tool.geoms):
+        geom.name = geom.name or f"{geom.parent.name}-{number}"  # a sensor names it
     if sim.robot == "hand":
         _add_floating(spec, tool, gripper)
         place = {"frame": spec.worldbody.add_frame()}

@@ -92,7 +92,9 @@ class CPhysics:
             qpos, qvel, sensed = simulator.rollout(scene, fields, joints)
         last = qpos[-1].astype(np.float32), qvel[-1].astype(np.float32)
         moved = model_fields.moved(world, scene, *last)
-        touching = sensed.reshape(substeps.touching.shape) > 0.0
+        found = sensed.reshape(len(sensed), len(world.hand_geoms), -1) > 0.0
+        parts = [found[:, world.hand_parts == part].any(axis=1) for part in range(outcome.PARTS)]
+        touching = np.stack(parts, axis=1)
         rise = np.float32(qpos[:, world.block_qpos[:, 2]] - scene.position[:, 2])
         gap = np.float32(world.gripper.gap(qpos[:, world.finger_qpos]))
         lag = np.float32(qpos[:, world.press_qpos] - joints.control[:, world.press])

@@ -82,10 +82,13 @@ def _restrain(world: World, parked: jax.Array, initial: mjx.Data, data: mjx.Data
 
 
 def _touch(world: World, data: mjx.Data) -> tuple[jax.Array, jax.Array]:
-    """Returns [3, N] bool, palm or pad touches block, and [] bool, all contact slots are in use."""
+    """Returns [3, N] bool, palm or finger touches block, and [] bool, all contacts are in use."""
     active, pair = data._impl.contact.dist < 0.0, data._impl.contact.geom  # [C], [C, 2]
-    is_pad = jnp.any(pair[None] == world.hand_geoms[:, None, None], axis=-1)
-    is_hand = is_pad & active[None]  # [3, C]
+    part_of_geom = np.full(world.model.ngeom, -1, np.int32)
+    part_of_geom[world.hand_geoms] = world.hand_parts
+    parts = jnp.asarray(part_of_geom)[pair]  # [C, 2]
+    of_part = jnp.any(parts[None] == np.arange(outcome.PARTS)[:, None, None], axis=-1)
+    is_hand = of_part & active[None]  # [3, C]
     slots = jnp.asarray(world.slot_of_geom)[pair]  # [C, 2]
     is_block = jnp.any(slots[None] == np.arange(len(world.slots))[:, None, None], axis=-1)  # [N, C]
     return jnp.any(is_hand[:, None] & is_block[None], axis=-1), jnp.all(active)

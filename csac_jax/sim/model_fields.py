@@ -29,14 +29,14 @@ def of_scene(world: World, fields: BlockFields, base: Base) -> dict[str, jax.Arr
     }
     changed = {name: base(name).at[index].set(rows) for name, (index, rows) in values.items()}
     if fields.grip is not None:
-        of_pads = changed["geom_friction"].at[world.hand_geoms[1:], 0]
+        of_pads = changed["geom_friction"].at[world.pads, 0]
         changed["geom_friction"] = of_pads.set(fields.grip.friction)
         force = base("actuator_forcerange").at[world.grip].set(fields.grip.force)
         changed["actuator_forcerange"] = force
     if fields.pads is not None:
         names = "geom_size", "geom_pos", "geom_rbound"
         for name, pads in zip(names, fields.pads, strict=True):
-            changed[name] = changed[name].at[world.hand_geoms[1:]].set(pads)
+            changed[name] = changed[name].at[world.pads].set(pads)
     return changed
 
 

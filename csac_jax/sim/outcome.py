@@ -15,13 +15,14 @@ STOPPED = 0.008  # m, a guarded descent that ends so far above its set-point was
 GRIP_RISE = 0.01  # m, a held block that rose this far was grasped
 BARE = 0.01  # m, a surface lower than this is bare table
 CLOSED_GAP = 0.005  # m, a smaller finger gap is a closed hand
+PARTS = 3  # of a hand: palm, low finger, high finger
 
 
 @struct.dataclass
 class Substep:
     """Sensor readings after one physics step. N = block slots."""
 
-    touching: jax.Array  # [3, N] bool, palm, low pad and high pad against each block
+    touching: jax.Array  # [PARTS, N] bool, each part of the hand against each block
     rise: jax.Array  # [N] m, height gained since the primitive began
     gap: jax.Array  # [] m, between the fingers, beyond that of the closed hand
     lag: jax.Array  # [] m, of the hand above its set-point
@@ -45,18 +46,16 @@ class Trace:
 def nothing_seen(substeps: int, num: int) -> Substep:
     """Returns the substeps of a primitive without motion, NumPy leaves [T, ...], all 0."""
     zeros: Any = np.zeros
-    touching, rise = zeros((substeps, 3, num), bool), zeros((substeps, num), np.float32)
+    touching, rise = zeros((substeps, PARTS, num), bool), zeros((substeps, num), np.float32)
     length = zeros(substeps, np.float32)
     return Substep(touching, rise, length, length, zeros(substeps, bool))
 
 
 def in_grip(touching: jax.Array) -> jax.Array:
-    """Returns [..., N] bool, a block touches a pad while each pad [..., 3, N] touches some block.
-
-    So two blocks side by side between the pads are held, too.
-    """
-    pads = touching[..., 1:, :]
-    return jnp.any(pads, axis=-2) & jnp.all(jnp.any(pads, axis=-1), axis=-1)[..., None]
+    """Returns [..., N] bool, a block touches a finger while each of `touching` [..., PARTS, N]
+    touches some block. So two blocks side by side between the fingers are held, too."""
+    fingers = touching[..., 1:, :]
+    return jnp.any(fingers, axis=-2) & jnp.all(jnp.any(fingers, axis=-1), axis=-1)[..., None]
 
 
 def trace_of(cfg: SimConfig, substeps: Substep) -> Trace:
@@ -89,7 +88,7 @@ def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax
     """Judges by ground truth, returns Outcome [] int32, CSAC eq. 15.
 
     `nothing`: the hand met no block on bare table. `empty`: none at a `surface` [] m from BARE up.
-    `touched`: no block that it met rose between the pads. `dropped`: one rose and was lost.
+    `touched`: no block that it met rose between the fingers. `dropped`: one rose and was lost.
     """
     dropped = trace.touched & jnp.any(trace.held_rise >= GRIP_RISE)
     lifted = jnp.any(lifted_blocks(trace, hand_rise))

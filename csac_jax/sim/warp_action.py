@@ -18,7 +18,7 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from csac_jax.config import SimConfig
-from csac_jax.sim import warp_graph
+from csac_jax.sim import outcome, warp_graph
 from csac_jax.world import scene_state
 from csac_jax.world.model import World
 
@@ -84,7 +84,7 @@ def _mark_touch(
     distance: wp.array[float],
     margin: wp.array[float],
     slot_of_geom: wp.array[int],  # [G], -1: no block
-    part_of_geom: wp.array[int],  # [G] 0 palm, 1 and 2 pads, -1: not of the hand
+    part_of_geom: wp.array[int],  # [G] 0 palm, 1 and 2 fingers, -1: not of the hand
     done: wp.array[int],
     touching: wp.array3d[int],  # [E, 3, N] last substep in which they did
 ):
@@ -190,9 +190,9 @@ class Batch:
         self.substeps = substeps = steps(cfg)
         names = fields(world, cfg)
         self.model, self.data = _put(world.model, cfg, scenes, names)
-        slots, parts = len(world.slots), len(world.hand_geoms)
+        slots, parts = len(world.slots), outcome.PARTS
         part_of_geom = np.full(world.model.ngeom, -1)
-        part_of_geom[world.hand_geoms] = np.arange(parts)
+        part_of_geom[world.hand_geoms] = world.hand_parts
         self._hand_and_blocks = [
             wp.array(index, dtype=int) for index in (world.slot_of_geom, part_of_geom)
         ]

@@ -129,7 +129,7 @@ def _model_fields(world: World, scene: SceneState) -> dict[str, jax.Array]:
     changed["geom_aabb"] = base("geom_aabb").reshape(-1, 2, 3).at[geoms].set(bounds)
     if fields.pads is not None:
         pads = _bounds(fields.pads.size)
-        changed["geom_aabb"] = changed["geom_aabb"].at[world.hand_geoms[1:]].set(pads)
+        changed["geom_aabb"] = changed["geom_aabb"].at[world.pads].set(pads)
     if world.objects is not None and fields.objects is not None:
         changed |= {name: base(name) for name in ("geom_quat", "body_iquat")}
         changed["geom_dataid"] = jnp.asarray(model.geom_dataid)

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import functools
 import hashlib
+import itertools
 import operator
 from typing import NamedTuple
 
@@ -55,7 +56,9 @@ class World:
     press_qpos: int  # address in qpos of the joint that gives way to more than sim.down_force
     press: int  # its actuator
     grip: int  # actuator of the fingers
-    hand_geoms: np.ndarray  # [3] geom ids: palm, low pad, high pad
+    pads: np.ndarray  # [2] geom ids, low and high
+    hand_geoms: np.ndarray  # [M] geom ids: palm, low finger's, high finger's
+    hand_parts: np.ndarray  # [M] of these: 0, 1 or 2
     mesh_scale: float  # size of compiled meshes of blocks relative to nominal
     objects: Bodies | None = None  # of slots of kind object; None without such slots
 
@@ -129,8 +132,8 @@ def _add_block_assets(spec: mujoco.MjSpec, mesh_scale: float) -> None:
 
 
 def _add_touch_sensors(spec: mujoco.MjSpec, gripper: Gripper, slots: int) -> None:
-    """Adds a sensor of the number of contacts for each of palm and pads x slots, in order."""
-    for geom in mjcf.hand_geoms(gripper):
+    """Adds a sensor of the number of contacts for each of the hand's geoms x slots, in order."""
+    for geom in itertools.chain(*mjcf.hand_geoms(spec, gripper)):
         for slot in range(slots):
             sensor = spec.add_sensor(type=mujoco.mjtSensor.mjSENS_CONTACT)
             sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, geom
@@ -170,7 +173,8 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     knows_force = sim.grip_force[1] == 0.0 or gripper.force is not None
     require(knows_force, f"sim.grip_force: '{gripper.name}' has no 'force' in its {NUMBERS}")
     with mjcf.errors_of(assets()):
-        model = _spec(scene, sim, gripper).compile()
+        spec = _spec(scene, sim, gripper)
+        model = spec.compile()
     for field in _MJX_IGNORES if sim.physics == "mjx" else ():  # `put_model` raises for others
         if np.any(operator.attrgetter(field)(model)):
             raise SceneError(f"MJX ignores {field}; leave it at 0, or take sim.physics c")
@@ -180,7 +184,7 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
     slot_of_body = np.full(model.nbody, -1)
     slot_of_body[bodies] = np.arange(len(bodies))
     slot_of_geom = slot_of_body[model.geom_bodyid]
-    joints = mjcf.joint_names(sim, gripper)
+    joints, hand = mjcf.joint_names(sim, gripper), mjcf.hand_geoms(spec, gripper)
     objects_at, bodies_of = np.flatnonzero(blocks.is_object(scene.slots)), None
     if scene.has_objects:
         library = object_slots.library(scene)
@@ -199,7 +203,9 @@ def build(scene: SceneConfig, sim: SimConfig) -> World:
         press_qpos=int(model.joint(mjcf.PRESS).qposadr[0]),
         press=model.actuator(mjcf.PRESS).id,
         grip=model.actuator(mjcf.PREFIX + gripper.actuator).id,
-        hand_geoms=np.array([model.geom(name).id for name in mjcf.hand_geoms(gripper)]),
+        pads=np.array([model.geom(name).id for name in mjcf.pads(gripper)]),
+        hand_geoms=np.array([model.geom(name).id for names in hand for name in names]),
+        hand_parts=np.repeat(np.arange(len(hand)), [len(names) for names in hand]),
         mesh_scale=float(model.mesh_scale[model.mesh("blocks/prism").id, 0]),
         objects=bodies_of,
     )
@@ -269,7 +275,7 @@ def scene_fields(world: World, scene: SceneState) -> BlockFields:
 
 def _pads(world: World, fingers: Fingers) -> PadFields:
     """Computes pads of these sizes; their inner faces stay in place."""
-    model, pads = world.model, world.hand_geoms[1:]
+    model, pads = world.model, world.pads
     length = jnp.full(2, model.geom_size[pads, 2], jnp.float32)
     half = (jnp.full(2, 0.5 * side) for side in (fingers.thickness, fingers.width))
     size = jnp.column_stack([*half, length])
@@ -281,7 +287,7 @@ def _pads(world: World, fingers: Fingers) -> PadFields:
 def _grip(world: World, grip: Grip) -> GripFields:
     model, own = world.model, world.gripper.force or 1.0
     share = jnp.where(grip.force > 0.0, grip.force / own, 1.0)
-    friction = np.float32(model.geom_friction[world.hand_geoms[1], 0])
+    friction = np.float32(model.geom_friction[world.pads[0], 0])
     return GripFields(
         friction=jnp.where(grip.friction > 0.0, grip.friction, friction),
         force=share * np.float32(model.actuator_forcerange[world.grip]),
@@ -377,10 +383,10 @@ def with_blocks(
     scales = np.repeat(fields.mesh_scale, counts)  # of corners, mesh by mesh
     model.mesh_vert[: len(scales)] = world.model.mesh_vert[: len(scales)] * scales[:, None]
     if fields.pads is not None:
-        pads = world.hand_geoms[1:]
+        pads = world.pads
         model.geom_size[pads], model.geom_pos[pads], model.geom_rbound[pads] = fields.pads
     if fields.grip is not None:
-        model.geom_friction[world.hand_geoms[1:], 0] = fields.grip.friction
+        model.geom_friction[world.pads, 0] = fields.grip.friction
         model.actuator_forcerange[world.grip] = fields.grip.force
     if world.objects is not None and fields.objects is not None:
         objects.put(model, world.objects, fields.objects)

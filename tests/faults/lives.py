@@ -332,14 +332,26 @@ class Life:
             error = caught.with_traceback(None)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
+            took = time.monotonic() - begun
+            if isinstance(error, Killed):
+                self._settle()
             _process.left = None
             for one in _process.locks:
                 one.release(force=True)
             _process.locks.clear()
-        slow = isinstance(error, _Hung) or time.monotonic() - begun > harness.HANG
+        slow = isinstance(error, _Hung) or took > harness.HANG
         self.tally.check(not slow, "hangs", f"{self.about()}: hung")
         self._judge_answer(error, refused)
         return error is not None
+
+    def _settle(self) -> None:
+        """Waits for threads of a killed process, whose next call fails, to end."""
+        looks: list[Any] = []
+        for _ in range(100):
+            looks.append([files for _, *files in os.walk(self.folder)])
+            if looks[-3:] == 3 * looks[-1:]:
+                return
+            time.sleep(0.02)
 
     def _judge_answer(self, error: BaseException | None, refused: bool) -> None:
         if error is None or isinstance(error, Killed | _Hung):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, grippers
-from csac_jax.config import Config, SceneConfig, SimConfig
+from csac_jax.config import Config, PhysicsKind, SceneConfig, SimConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Grip
@@ -22,7 +22,7 @@ from csac_jax.sim import c_physics, outcome, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
-from tests.sim.conftest import planned
+from tests.sim.conftest import WARP, planned
 from tests.world import placed
 
 HALF = 0.025  # m, of a cube
@@ -112,8 +112,43 @@ def _tips(world: model.World, qpos: np.ndarray) -> float:
     data = mujoco.MjData(world.model)
     data.qpos[:] = qpos
     mujoco.mj_kinematics(world.model, data)
-    pads = world.hand_geoms[1:]
+    pads = world.pads
     return float(np.min(data.geom_xpos[pads, 2] - world.model.geom_size[pads, 2]))
+
+
+@pytest.mark.parametrize("engine", ["c", "mjx", WARP])
+def test_a_finger_holds_above_its_pad(engine: PhysicsKind):
+    """Claim: a plank on a thin post is lifted by what is above the pads of a Franka Hand."""
+    post, plank = (0.008, 0.0125, 0.0225), (0.03, 0.0125, 0.006)
+    scene = _scene([(0.0, 0.0), (0.0, 0.0)])
+    scene = scene.replace(
+        half_size=np.float32([post, plank]),
+        position=np.float32([[0.0, 0.0, post[2]], [0.0, 0.0, 2 * post[2] + plank[2]]]),
+    )
+    cfg = _config(2, physics=engine, gripper="franka_hand")
+    _, trace, lifted = _run(cfg, scene, [[0.0, 0.0, 0.0]])
+    assert trace.touched[0]
+    assert lifted[0].tolist() == [False, True]
+
+
+@pytest.mark.parametrize("gripper", ["rg2", "2f85", "franka_hand", "wsg32"])
+def test_fingers_are_all_that_moves_with_a_pad(gripper: str):
+    """Claim: a hand's parts are its palm and, of each side, the geoms of the bodies that a finger
+    joint moves; each pad is the first of its finger."""
+    cfg = _config(1, gripper=gripper)
+    world = model.build(cfg.scene, cfg.sim)
+    data, moved = mujoco.MjData(world.model), []
+    for opening in world.gripper.positions[0][1], world.gripper.positions[0][0]:
+        data.qpos[world.robot_qpos[-len(world.gripper.joints) :]] = opening
+        mujoco.mj_kinematics(world.model, data)
+        moved.append(data.geom_xpos[:, 0].copy())
+    inwards = moved[1] - moved[0]
+    meets = world.model.geom_contype > 0
+    for part, way in ((1, 1.0), (2, -1.0)):
+        found = np.flatnonzero(meets & (way * inwards > 1e-4))
+        assert sorted(world.hand_geoms[world.hand_parts == part]) == found.tolist()
+        assert world.hand_geoms[world.hand_parts == part][0] == world.pads[part - 1]
+    assert (world.hand_parts == 0).sum() == 1
 
 
 @pytest.mark.slow
