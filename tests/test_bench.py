@@ -1,7 +1,5 @@
 """The benchmarks' own arithmetic."""
 
-import contextlib
-import json
 import subprocess
 import sys
 
@@ -12,8 +10,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.errors import FailedError, SettingsError
 from csac_jax.nets import dense
-from experiments import index
-from experiments.bench import __main__ as page, learner, serve, step_kernels
+from experiments.bench import learner, serve, step_kernels
 
 
 def test_operations_are_those_of_the_net():
@@ -52,24 +49,3 @@ def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
     )
     with pytest.raises(FailedError, match=r"did not start \(exit code 2\): no such extra$"):
         serve.measure(1, 9)
-
-
-def test_page_shows_figures_and_failures():
-    """Claim: the page of `make bench` has the main figures of a result, or why there is none."""
-    rates = [{"actions_per_second": rate} for rate in (1.25, 3.0)]
-    shown = [row["value"] for row in page.rows("sweep", {"rows": rates, "wall_seconds": 2})]
-    assert shown == ["1.25", "3", "2"]
-    (row,) = page.rows("sweep", {"failed": "no room", "wall_seconds": 2})
-    assert row == {"benchmark": "sweep", "figure": "failed", "value": "no room"}
-    assert page.FIGURES.keys() == page.MAIN.keys()
-
-
-def test_page_reads_what_benchmarks_write():
-    """Claim: the main figures of the page are those of a recorded result of each benchmark."""
-    for name, places in page.FIGURES.items():
-        records = json.loads((index.RESULTS / "bench" / f"{name}.json").read_text())
-        shown = []
-        for record in records.values():
-            with contextlib.suppress(KeyError, IndexError):
-                shown.append(page.rows(name, {"wall_seconds": 1, **record}))
-        assert any(len(rows) == 1 + len(places) for rows in shown), name

@@ -105,7 +105,7 @@ def _value(fixed: Fixed, seen: DenseMaps, primitive: int, pose: np.ndarray) -> f
     return float(maps.read(fixed.learner.frames, seen.q[0], *at))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_quarter_turn(net, seed):
     """Claim: of a scene turned by a quarter turn each net's maps are the same, a quarter turn on,
     and its best action is the turned one, among yaws whose pass does not turn upside down with
@@ -122,7 +122,7 @@ def test_quarter_turn(net, seed):
     assert_allclose(turned, _turned(pose, 0.5 * np.pi), atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_yaw_step(net, seed):
     """Claim: of a smooth scene turned by one yaw step, 30 degrees here, maps change by a twentieth
     of their spread at most, those of DenseNet by a quarter, for cells are the nearest ones; and the

@@ -14,7 +14,6 @@ from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
-from csac_jax.runtime import compiler
 
 KEYS = 20
 
@@ -183,35 +182,3 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts, start, le
 
     share = np.mean(jax.jit(jax.vmap(reached))(jnp.arange(1000)))
     assert least <= share <= most, share
-
-
-@pytest.mark.slow
-def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
-    """Claim: with the options of training on a CPU, 200 searches end where they do by XLA's own."""
-
-    def search(i: jax.Array) -> jax.Array:
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(5), i))
-        state, both = _peaked(keys[0], frames), cfg.change(cem=CEMConfig(start="both"))
-        return policy.greedy(keys[1], parts(both), state, jnp.int32(0)).values
-
-    own = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
-    sooner, by_default = (
-        jax.jit(jax.vmap(search), compiler_options=options)(jnp.arange(200))
-        for options in (compiler.SOONER, {name: own[name] for name in compiler.SOONER})
-    )
-    assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_candidates_are_those_of_the_search(cfg, frames, parts):
-    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
-    key; VPG's only candidate is the best pixel."""
-    one = parts(cfg.change(cem={"rounds": 1, "start": "actor"}))
-    vpg, state, key = parts(algorithms.configure(cfg, "vpg")), _state(frames, 0), jax.random.key(3)
-    for own, num in ((one, cfg.cem.candidates), (vpg, 1)):
-        tried = jax.jit(lambda key, own=own: policy.candidates(key, own, state))(key)
-        assert tried.shape == (2, num, 3)
-        greedy = jax.jit(lambda key, own=own: policy.greedy(key, own, state, jnp.int32(0)).poses)
-        for poses, u in zip(np.asarray(tried), greedy(key), strict=True):
-            pose = np.asarray(maps.denormalise(frames, u))
-            assert np.abs(poses - pose[None]).max(axis=1).min() < 1e-5

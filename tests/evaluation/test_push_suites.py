@@ -19,7 +19,7 @@ from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.nets import networks
 from csac_jax.objects import tables
 from csac_jax.scenes import cases, certify, constructions, pool
-from csac_jax.vision import heightmap, observe
+from csac_jax.vision import observe
 from csac_jax.world import model, object_slots
 from csac_jax.world.scene_state import SceneState
 from tests.vision import mujoco_rays
@@ -141,13 +141,6 @@ def test_every_policy_searches_for_a_hidden_target():
         after = step(state, action)
         assert np.isfinite(np.asarray(after.reward)), name
         assert not bool(after.info.physics_diverged), name
-
-
-def test_wanted_is_the_mask_or_everything():
-    """Claim: `heightmap.wanted` is the mask where a cell of it is True, else True everywhere."""
-    mask = jnp.zeros((8, 8), bool).at[2, 3].set(True)
-    np.testing.assert_array_equal(heightmap.wanted(mask), mask)
-    assert np.asarray(heightmap.wanted(jnp.zeros((8, 8), bool))).all()
 
 
 def test_tight_objects_hardly_fit(monkeypatch: pytest.MonkeyPatch):

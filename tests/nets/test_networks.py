@@ -113,23 +113,6 @@ def test_states_of_densenet_are_seen_in_groups():
             assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["small", "densenet121"])
-def test_looks_at_any_number_of_states_share_products(kind: str):
-    """Claim: one state and eight share the shapes of products with DenseNet-121 alone."""
-    nets = networks.make(TINY[kind])
-    variables = jax.eval_shape(nets.critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
-
-    def products(states: int) -> set[str]:
-        net_input = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
-        look = jax.jit(lambda variables, net_input: networks.apply(nets, variables, net_input))
-        lines = look.lower(variables, net_input).as_text().splitlines()
-        named = ("stablehlo.convolution", "stablehlo.dot_general")
-        return {line.split(" : ")[-1] for line in lines if any(name in line for name in named)}
-
-    assert products(1)
-    assert (products(1) == products(8)) == (kind == "densenet121")
-
-
 def test_mirrored_maps_are_the_mean_of_four_looks():
     """Claim: of a scene in a mirror along or across the frame, the mirrored Q is the mirror of the
     scene's Q, pushes ahead and back swapped along it; and it is the mean of four looks."""

@@ -132,12 +132,3 @@ def test_policies_without_networks_have_the_task_of_the_scene(scene: str, kind: 
     """Claim: the planner gets the marked block in a suite that marks one, else it clears."""
     policy = play._policy(play.PlayOptions(scene=scene, policy="planner"))
     assert policy.cfg.task.kind == kind
-
-
-def test_video_without_the_extra_names_it(here, capsys, monkeypatch: pytest.MonkeyPatch):
-    """Claim: without ffmpeg's wheel, --video says how to get it, before simulating."""
-    import importlib.util
-
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert cli.main(["play", "--scene", "cube.json", "--video", "a.mp4"]) == 2
-    assert "--video needs an extra; run: pip install 'csac-jax[video]'" in capsys.readouterr().err

@@ -117,6 +117,7 @@ def test_all_that_follows_from_blocks_is_the_scenes():
     assert expected <= changed
 
 
+@pytest.mark.slow
 def test_grasps_agree_with_c(grasped, grasped_in_c):
     """Claim: a grasp has the same outcome in C MuJoCo in at least 95 of 100 scenes, and blocks move
     as far: to 1 mm in the median scene, 5 mm on average."""
