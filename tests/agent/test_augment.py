@@ -102,20 +102,6 @@ def test_view_is_that_of_the_mirrored_scene(transition, flags):
     assert (turned.action.primitive, turned.reward, turned.terminated) == (0, 0.5, True)
 
 
-def test_colours_turn_too():
-    """Claim: blocks that lie flat keep their colours under all eight."""
-    flat = Rotation.from_euler("z", [[0.4], [1.1], [2.0]])
-
-    def scene(matrix: np.ndarray) -> SceneState:
-        whole = _scene(flat, POSITION, matrix)
-        away = whole.position.at[2].set(jnp.array([3.0, 0.0, 1.0]))
-        return whole.replace(position=away, in_play=jnp.array([True, True, False]))
-
-    transition = _transition(scene(np.eye(3)))
-    for flags in FLAGS:
-        assert _off(look(scene(_matrix(flags))), _turn(flags, transition).obs, "colour") < 0.003
-
-
 def _signature(transition: Transition) -> tuple:
     return np.asarray(transition.obs.height).tobytes(), np.asarray(transition.obs.colour).tobytes()
 

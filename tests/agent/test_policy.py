@@ -32,12 +32,6 @@ def best(cfg, parts):
     return jax.jit(lambda state: run(jax.random.split(jax.random.key(0), KEYS), state))
 
 
-def _explore(parts, state: DenseMaps, num: int, unchanged: int = 0) -> Action:
-    """Actions to try for `num` keys."""
-    act = lambda key: policy.act(key, parts, state, jnp.int32(unchanged), jnp.int32(0))  # noqa: E731
-    return jax.jit(jax.vmap(act))(jax.random.split(jax.random.key(2), num))
-
-
 def _state(frames, seed: int) -> DenseMaps:
     """Random maps of which a twentieth is valid."""
     rng, shape = np.random.default_rng(seed), frames.reachable.shape
@@ -134,13 +128,6 @@ def test_retries_follow_boltzmann(cfg, frames, parts, failed):
     share = np.bincount(off.argmin(axis=1), minlength=4) / len(off)
     wanted = np.exp(values / 0.5) if failed else np.array([1.0, 0.0, 0.0, 0.0])
     assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
-
-
-def test_grasp_only_never_pushes(cfg, frames, parts):
-    """Claim: grasp_only grasps while it explores too, where pushes are worth more."""
-    own, state = parts(algorithms.configure(cfg, "grasp_only")), _state(frames, 6)
-    state = state.replace(q=state.q.at[Primitive.PUSH].add(5.0))
-    assert np.all(_explore(own, state, 200, unchanged=3).primitive == Primitive.GRASP)
 
 
 def _peaked(key: jax.Array, frames) -> DenseMaps:

@@ -16,7 +16,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, cli, presets
-from csac_jax.cli import bench, evaluate, settings, sweep, train
+from csac_jax.cli import evaluate, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, UniformReplay
 from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import policies, suites
@@ -371,20 +371,6 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
     one line and exit code 2."""
     _fails(capsys, 2, f"train quick --replay.capacity {2**30}", "replay.capacity: ")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_benchmark_is_run_with_its_arguments(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    """Claim: `bench NAME ...` calls `main` of that file of the checkout."""
-    monkeypatch.setattr(bench, "BENCHMARKS", tmp_path)
-    _fails(capsys, 2, "bench one")
-    Path("one.py").write_text("def main(arguments):\n    print(arguments)\n")
-    Path("_helper.py").write_text("")
-    assert cli.main(["bench", "one", "a", "--b"]) == 0
-    assert cli.main(["bench", "--help"]) == 0
-    shown = "usage: csac-jax bench NAME ..., with NAME one of: one\n"
-    assert capsys.readouterr().out == f"['a', '--b']\n{shown}"
 
 
 @pytest.mark.slow

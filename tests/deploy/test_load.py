@@ -18,7 +18,6 @@ import pytest
 from csac_jax import presets
 from csac_jax.deploy import image_files as files, record
 from csac_jax.deploy.record import Recorder
-from csac_jax.errors import SettingsError
 from tests.deploy import image_files
 
 pytest.importorskip("uvicorn")
@@ -145,26 +144,6 @@ def test_hostile_bodies_stop_nobody(start: Callable[..., Service], body: bytes):
     assert len(answer["detail"]) < 400
     assert seconds < 3.0
     assert slowest < 1.0
-
-
-def test_parsing_stops_nobody(
-    start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    """Claim: /health answers while bodies are parsed and while an outcome is written."""
-
-    def slow(*_: Any) -> Any:
-        time.sleep(1.0)
-        raise SettingsError("slow")
-
-    monkeypatch.setattr(requests, "question", slow)
-    monkeypatch.setattr(Recorder, "post", slow)
-    running = start(0.0, tmp_path)
-    outcome = {"id": "000001", "outcome": "lifted"}
-    for path, body in (("/decide", BODY), ("/outcome", outcome)):
-        connection = running.send(path, body)
-        time.sleep(0.2)
-        assert running.ask("/health")[2] < 0.5
-        assert connection.getresponse().status == 400
 
 
 def test_waiting_requests_are_decided_together(

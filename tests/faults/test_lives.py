@@ -1,4 +1,4 @@
-"""Forty lives of runs, sweeps and policies; `make lives` lives more."""
+"""Forty lives of runs and sweeps; `make lives` lives more."""
 
 import pytest
 

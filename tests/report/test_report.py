@@ -265,30 +265,6 @@ def test_rates_of_training_stand_side_by_side(tmp_path: Path):
     assert cells == [["0.500", "50.0 %", "7.50", "3.00"], ["-"] * 4]
 
 
-def test_old_names_are_read_as_todays(tmp_path: Path):
-    """Claim: logs, evaluations and configs with former names say what they would say now, a config
-    of a network that is gone, too."""
-    old = _config("csac_beta", 0) | {"net": {"kind": "offset"}}
-    old["scene"]["arranged"] = 0.5
-    del old["scene"]["packed_fraction"]
-    _run(tmp_path / "run", old, [0.5])
-    (run,) = results.read([tmp_path / "run"]).runs
-    assert dict(run.variant.changed).items() >= {"scene.packed_fraction": "0.5"}.items()
-    line = {"step": 1, "actions": 8, "grasps_counted": 0, "seconds": 1.0}
-    log = tmp_path / "run" / "metrics.jsonl"
-    log.write_text(json.dumps({**line, "ill": 1, "left": 2, "saturated": 3}) + "\n")
-    new = {"physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
-    assert files.read_log(log) == [{**line, **new}]
-    share = metrics.wilson(1, 10)
-    part = {"completion": share, "counts": {"left": 2}}
-    content = {"policy": "learned", "suite": "own", "parts": {"own": part}, "config": old}
-    (tmp_path / "eval.json").write_text(json.dumps(content))
-    (one,) = results.read([tmp_path / "eval.json"]).evaluations
-    assert (one.suite, one.part) == ("in_distribution", "in_distribution")
-    assert one.metrics["counts"] == {"blocks_lost": 2}
-    assert one.config["scene"]["packed_fraction"] == 0.5
-
-
 def test_robots_of_training_are_told_apart(tmp_path: Path):
     """Claim: runs with another robot are another variant; an evaluation with another robot stays
     of its run's variant."""

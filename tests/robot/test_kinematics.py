@@ -296,21 +296,6 @@ def _branches(start: tuple, end: tuple) -> tuple:
 WAY = (0.05, 0.0, 0.1, 0.3, 0.0), (-0.05, 0.1, 0.1, 0.3, 0.0)
 
 
-def test_targets_keeps_to_one_branch():
-    """Claim: the branch reaches every set-point, even if the arm starts in one that does not."""
-    ends = (0.2, 0.0, 0.1, 0.0, 0.0), (-0.2, 0.2, 0.1, 0.0, 0.0)
-    control, solutions, valid, is_free = _branches(*ends)
-    valid = valid & is_free
-    partly = np.flatnonzero(valid[0] & ~valid.all(axis=0))
-    assert partly.size
-    for branch in partly:
-        target, reachable = targets_of(solutions[0, branch], control)
-        assert reachable
-        apart = _angles_apart(np.asarray(solutions), np.asarray(target)[:, None, :6]).max(axis=0)
-        assert (apart < 1e-4).sum() == 1
-        assert valid.all(axis=0)[apart.argmin()]
-
-
 def test_targets_takes_the_branch_it_is_in():
     """Claim: of branches that reach every set-point, the one with the least motion is taken; none
     through the table or the arm itself."""

@@ -230,21 +230,3 @@ def test_settings_that_allow_none_are_an_error():
             packings.available(slots)
     with pytest.raises(ValueError, match=r"heightmap\.extent: .* at least 0\.412 m"):
         arrange.arrange(jax.random.key(0), MANY, 0.4, jnp.float32(0.5))
-
-
-@pytest.mark.slow
-def test_key_decides():
-    """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
-    cfg = SceneConfig(slots=("box", "box", "arch"), min_blocks=3)
-    levels = jnp.linspace(0.0, 1.0, 8)
-    *pair, keys = (jax.random.split(jax.random.key(1), 8) for _ in range(3))
-    batch, again = (_many(cfg, 0.448, same, levels) for same in pair)
-    jax.tree.map(np.testing.assert_array_equal, batch, again)
-    single = jax.jit(arrange.arrange, static_argnums=(1, 2))
-    alone = jax.device_get(single(keys[3], cfg, 0.448, levels[3]))
-    row = jax.tree.map(lambda leaf: leaf[3], batch)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), alone, row)
-    parked = scene_state.parked(cfg.slots)
-    assert jax.tree.all(jax.tree.map(lambda one, two: one.dtype == two.dtype, alone, parked))
-    for name in ("position", "half_size", "density", "friction", "colour"):
-        assert len({row.tobytes() for row in getattr(batch, name)}) == 8, name

@@ -129,25 +129,6 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
 
 
 @needs_warp
-def test_a_started_primitive_ends_like_one_that_is_run(ran: Ran):
-    """Claim: primitives in the background of other work end as without it."""
-    physics: Any = _physics("warp")
-
-    @jax.jit
-    def overlapped(work: jax.Array) -> tuple[Any, jax.Array]:
-        tokens = jax.vmap(physics.start)(ran.scene, ran.joints)
-        work = jax.lax.fori_loop(0, 50, lambda _, w: jnp.tanh(w @ w), work + tokens[0])
-        finish = jax.vmap(physics.finish, (0, 0, None))
-        return finish(ran.scene, tokens, work[0, 0]), work
-
-    (after, trace), work = overlapped(jnp.eye(512))
-    assert np.isfinite(work).all()
-    well = ~np.isin(list(CASES), ["nan", "kicked"])
-    np.testing.assert_allclose(after.position[well], ran.warp[0].position[well], atol=1e-5)
-    np.testing.assert_array_equal(trace.touched, ran.warp[1].touched)
-
-
-@needs_warp
 def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
     """Claim: sizes, masses and frictions are those of each scene."""
     rows = [0, 0, 4, 4]  # a cube that slides while nothing is grasped, a cube that is lifted

@@ -3,8 +3,6 @@
 import dataclasses
 import functools
 from collections.abc import Callable
-from concurrent.futures import Future
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -129,31 +127,6 @@ def test_two_programs_do_what_one_does(run: Run):
             np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5, err_msg=name)
     assert metrics.learned.all()
     assert not run.metrics[0].learned.all()
-
-
-def test_acting_does_not_wait_for_what_learns():
-    """Claim: each step acts, then learns once updates begin. Until then a chunk needs the program
-    that acts alone; from there on it waits for the other one, and fails as that does."""
-    cfg = CFG.change(train={"scenes": 4, "learning_starts": 12})  # the third step learns
-
-    def act(state: Any) -> tuple[Any, dict[str, Any]]:
-        calls = [*state.calls, "act"]
-        return SimpleNamespace(step=state.step + 1, calls=calls), {"learned": False}
-
-    def learn(state: Any, metrics: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return SimpleNamespace(step=state.step, calls=[*state.calls, "learn"]), {"learned": True}
-
-    failed, later = Future[Any](), Future[Any]()
-    failed.set_exception(MemoryError("no room"))
-    later.set_result(learn)
-    chunk = split_step.Chunk(cfg, 2, act, failed)
-    state, metrics = chunk(SimpleNamespace(step=0, calls=[]))
-    np.testing.assert_array_equal(metrics["learned"], [False, False])
-    with pytest.raises(MemoryError, match="no room"):
-        chunk(state)
-    state, metrics = chunk._replace(learn=later)(state)
-    assert state.calls == ["act", "act", "act", "learn", "act", "learn"]
-    np.testing.assert_array_equal(metrics["learned"], [True, True])
 
 
 class Pusher(Learner):
