@@ -241,12 +241,9 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     run, _ = trained
     cfg, stop = SMOKE.change(seed=1), Stop()
     stop.signal = 15  # before the first chunk: a run saves its first state
-    plain, begun = (
-        api.train(cfg, tmp_path / name, init=init, stop=stop, verbose=False)
-        for name, init in (("plain", None), ("begun", run.run_dir))
-    )
+    begun = api.train(cfg, tmp_path / "begun", init=run.run_dir, stop=stop, verbose=False)
     assert (begun.summary.step, begun.summary.stopped_by) == (0, 15)
-    fresh, state, last = map(_saved, (plain, begun, run))
+    fresh, state, last = programs.init(programs.make(cfg)), _saved(begun), _saved(run)
     _assert_starts_from(state.learner, last.learner.online, fresh.learner)
     _assert_same(begun.policy.params, run.policy.params)
     _assert_same(state.scenes, fresh.scenes)

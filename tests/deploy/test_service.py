@@ -25,7 +25,7 @@ from csac_jax.deploy import decider, server, service  # isort: skip
 
 TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
-CLIENTS = 50
+CLIENTS = 16
 
 
 def _base64(content: bytes) -> str:
@@ -228,7 +228,7 @@ def test_body_without_a_length_is_limited(server: Server, token: str):
 
 
 def test_many_clients_lose_nothing(server: Server):
-    """Claim: 50 clients at once, each with its own `top`, all get their own answer."""
+    """Claim: 16 clients at once, each with its own `top`, all get their own answer."""
     tops = [1 + number % 3 for number in range(CLIENTS)]
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
         asked = [pool.submit(server.ask, "POST", "/decide", {**BODY, "top": n}) for n in tops]

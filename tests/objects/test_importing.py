@@ -125,8 +125,7 @@ def test_a_pipe_is_refused(tmp_path: Path):
         importing.files([tmp_path / "a.stl"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_workers_end_with_the_import(tmp_path: Path, number: signal.Signals):
+def test_workers_end_with_the_import(tmp_path: Path):
     """Claim: an import that is killed leaves no worker."""
     knot = trimesh.creation.torus(0.05, 0.02, 96, 48)
     paths = [_file(tmp_path, knot, f"{name}.stl") for name in range(4)]
@@ -140,7 +139,7 @@ def test_workers_end_with_the_import(tmp_path: Path, number: signal.Signals):
     )
     _wait_until(lambda: len(_workers(process.pid)) == 2, 60)
     workers = _workers(process.pid)
-    process.send_signal(number)
+    process.send_signal(signal.SIGKILL)
     process.wait(20)
     _wait_until(lambda: not any(Path(f"/proc/{worker}/cmdline").exists() for worker in workers), 20)
 
