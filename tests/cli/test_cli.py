@@ -21,7 +21,7 @@ from csac_jax.config import BetaReplay, Config, DenseNet121, UniformReplay
 from csac_jax.errors import DataWarning, SettingsError
 from csac_jax.evaluation import policies, suites
 from csac_jax.io import checkpoint
-from csac_jax.runtime import signals
+from csac_jax.runtime import modules, signals
 from csac_jax.section import Section
 from csac_jax.sweeps import runner
 from csac_jax.training.callbacks import RunInfo, RunRecord, Summary
@@ -455,6 +455,7 @@ def test_commands_load_modules(
     for module, name in ((presets, "PRESETS"), (algorithms, "ALGORITHMS"), (suites, "SUITES")):
         monkeypatch.setattr(module, name, dict(getattr(module, name)))
     monkeypatch.setattr(policies, "BASELINES", dict(policies.BASELINES))
+    monkeypatch.setattr(modules, "_loaded", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
     Path("my_module.py").write_text(MODULE)
     trained: list[Any] = []
