@@ -201,6 +201,7 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
     return len(steps)
 
 
+@pytest.mark.slow
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order."""
     for module in ("jax2onnx", "onnxruntime"):
