@@ -173,7 +173,8 @@ class Env:
     def start(self, state: State, action: Action) -> Started:
         """Starts an action, which Warp runs in the background until `finish`."""
         before, valid = self._validate(state)
-        return simulation.start(self.physics, self.cfg, before, state.obs.height, action, valid)
+        given = before, state.obs.height, action, valid
+        return simulation.start(self.physics, self.cfg, *given, background=True)
 
     def finish(self, state: State, started: Started, after: jax.Array) -> State:
         """Returns the state after an action that was started, as `step`. Physics may run until

@@ -62,9 +62,9 @@ def fast() -> Config:
     """Learns on one GPU from 4,096 scenes of ten blocks of all eight shapes, most of them packed.
 
     Updates are many and small, and transitions drawn from the replay are shifted, as in
-    `paper_small`. A failed grasp costs more than a poor push, half of the random primitives are
-    pushes, and blocks that leave cost. Physics is Warp's where it is installed, so meshes are of
-    one size. Results: docs/benchmarks/learning-ablations.md.
+    `paper_small`. They are made while Warp moves the hands. A failed grasp costs more than a poor
+    push, half of the random primitives are pushes, and blocks that leave cost. Physics is Warp's
+    where it is installed, so meshes are of one size. Results: docs/benchmarks/speed-gpu.md.
     """
     packed = {"packed_fraction": 0.75, "drop_extent": (0.1, 0.25), "size_jitter": (0.1, 0.0)}
     length = {"actions": 655360, "learning_starts": 4096, "chunk": 2, "save_every": 20}
@@ -79,7 +79,7 @@ def fast() -> Config:
         explore={"epsilon_primitive": (0.5, 0.2), "push_fraction": 0.5, "epsilon_decay": 0.9998},
         learn={**updates, "critics": 2, "loss": "squared"},
         replay={"capacity": 65536, "end": (1.0, 4.0)},
-        train={"scenes": 4096, **length},
+        train={"scenes": 4096, "overlap": True, **length},
     )
 
 

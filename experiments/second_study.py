@@ -63,11 +63,15 @@ ABOUT = {
     "guarded": "a guarded descent, with and without pushes",
 }
 NONE = "--policy.primitive grasp --explore.push-fraction 0"  # no pushes
-LARGE = "pushes --algo csac --train.actions 327680 --together 1"  # five take more than 141 GB
+LARGE = (
+    "pushes --algo csac --train.actions 327680 --together 1 "  # five take more than 141 GB
+    "--train.no-overlap"
+)
 CLEAR = "--scene.certified blocked --task.kind clear --task.max-actions 15"
 SMALL = (
     "--train.scenes 64 --train.actions 20480 --train.learning-starts 256 "
-    "--train.chunk 20 --replay.capacity 20480 --sim.physics warp --learn.updates-per-step {}"
+    "--train.chunk 20 --replay.capacity 20480 --sim.physics warp --train.no-overlap "
+    "--learn.updates-per-step {}"
 )
 """Settings of `pushes` in 64 scenes: as many updates of 64 as transitions are drawn an action."""
 SAMPLERS: dict[str, tuple[str, Sampler | None]] = {

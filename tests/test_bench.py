@@ -1,21 +1,36 @@
 """The benchmarks' own arithmetic."""
 
-import jax
-import jax.numpy as jnp
+import contextlib
+import json
+import subprocess
+import sys
 
-from csac_jax import presets
-from csac_jax.nets import dense
-from experiments.bench import learner
+import pytest
+
+from csac_jax.errors import FailedError
+from experiments import index
+from experiments.bench import __main__ as page, serve
 
 
-def test_operations_are_those_of_the_net():
-    """Claim: the operations of a pass are XLA's count of its convolutions and products, to 3 %:
-    XLA leaves out the taps beyond the borders, and counts the norms."""
-    net = presets.quick().net
-    cells = 64
-    maps = jnp.zeros((1, cells * net.stride, cells * net.stride, 4))
-    critic = dense.Critic(net)
-    variables = jax.eval_shape(critic.init, jax.random.key(0), maps)
-    counted = jax.jit(critic.apply).lower(variables, maps).cost_analysis()["flops"]
-    ours = sum(learner._operations(net, 4, cells).values())
-    assert abs(ours / counted - 1.0) < 0.03, (ours, counted)
+def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
+    """Claim: a service that ends before it answers is one line, with its exit code and the last
+    line that it wrote to stderr."""
+    text = "import sys; sys.stderr.write('a warning\\nno such extra\\n'); sys.exit(2)"
+    start = subprocess.Popen
+    monkeypatch.setattr(serve, "body", bytes)
+    monkeypatch.setattr(
+        serve.subprocess, "Popen", lambda _, **pipes: start([sys.executable, "-c", text], **pipes)
+    )
+    with pytest.raises(FailedError, match=r"did not start \(exit code 2\): no such extra$"):
+        serve.measure(1, 9)
+
+
+def test_page_reads_what_benchmarks_write():
+    """Claim: the main figures of the page are those of a recorded result of each benchmark."""
+    for name, places in page.FIGURES.items():
+        records = json.loads((index.RESULTS / "bench" / f"{name}.json").read_text())
+        shown = []
+        for record in records.values():
+            with contextlib.suppress(KeyError, IndexError):
+                shown.append(page.rows(name, {"wall_seconds": 1, **record}))
+        assert any(len(rows) == 1 + len(places) for rows in shown), name

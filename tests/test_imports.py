@@ -83,7 +83,6 @@ JIT_IN = (
     "scenes/arrange.py",
     "agent/maps.py",  # where an arm reaches is a table, computed once
     "nets/networks.py",  # a net that is seen from several places of a step is traced once
-    "render/picture.py",  # draws on machines without OpenGL
     "gym.py",  # its users call it step by step
 )
 PURE = ("vision", "nets", "agent", "replay", "sim")  # no printing, no files

@@ -48,12 +48,8 @@ def run(arguments: list[str]) -> int:
     from csac_jax.deploy import image_files
 
     policy = options.load()
-    image = (
-        image_files.read_rgb(options.rgb),
-        image_files.read_depth(options.depth),
-        image_files.read_intrinsics(options.intrinsics),
-        image_files.read_pose(options.pose),
-    )
+    files = options.rgb, options.depth, options.intrinsics, options.pose
+    image = image_files.read_image(*files)
     return (_check if options.check else _decide)(options, policy, image)
 
 

@@ -190,7 +190,10 @@ def _measure_all(options: EvalOptions, changes: dict[str, Any], out: Path) -> in
     for suite in chosen:
         suites.check(suite)
     tag = _digest(options, policy, cfg)
-    numbers = {suite: options.episodes or _episodes(options, suite) for suite in chosen}
+    numbers = {}
+    for suite in chosen:
+        full = suites.SUITES[suite].episodes if suite in suites.SUITES else EPISODES
+        numbers[suite] = options.episodes or max(1, round(options.share * full))
     paths = {suite: out / f"{Path(suite).stem}.json" for suite in chosen}
     waiting = [suite for suite in chosen if not _is_kept(paths[suite], numbers[suite], tag)]
     for suite in sorted(set(chosen) - set(waiting)):
@@ -222,13 +225,6 @@ def _fitting(options: EvalOptions, cfg: Any) -> tuple[str, ...]:
         for name, suite in suites.SUITES.items()
         if suite.target in targets and (has_library or not suite.objects)
     )
-
-
-def _episodes(options: EvalOptions, suite: str) -> int:
-    from csac_jax.evaluation import suites
-
-    full = suites.SUITES[suite].episodes if suite in suites.SUITES else EPISODES
-    return max(1, round(options.share * full))
 
 
 def _digest(options: EvalOptions, policy: Any, cfg: Any) -> str:

@@ -1,9 +1,6 @@
 """`csac-jax finetune`: a policy learns from what it did."""
 
 import dataclasses
-import datetime
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import tyro
@@ -14,8 +11,6 @@ from csac_jax.cli.robot_options import PolicyOptions, naming_the_option
 from csac_jax.errors import SettingsError
 from csac_jax.runtime import signals
 from csac_jax.section import require
-
-INTERVAL = 10.0  # s between lines
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,7 +50,14 @@ def run(arguments: list[str]) -> int:
     policy = CameraPolicy.load(options.policy, gripper=options.gripper)
     names = fine_tuning.Settings._fields
     settings = fine_tuning.Settings(*(getattr(options, name) for name in names))
-    tuned, summary = fine_tuning.run(policy, options.record, settings, _printer(), stop)
+    with output.progress() as bar:
+        task = bar.add_task("updates", total=None)
+
+        def show(done: int, total: int, td_error: float) -> None:
+            title = f"updates, TD error {td_error:.3f}"
+            bar.update(task, completed=done, total=total, description=title)
+
+        tuned, summary = fine_tuning.run(policy, options.record, settings, show, stop)
     policy_file.save(options.out, tuned.params, tuned.cfg)
     print(
         f"learned from {summary.actions} actions, {summary.lifted} of them lifted something; "
@@ -76,18 +78,3 @@ def _check(options: FinetuneOptions) -> None:
     check_seed(options.seed)
     require(1 <= options.batch <= 4096, "--batch: must lie in 1 .. 4096")
     require(0.0 < options.learning_rate < 1.0, "--learning-rate: must lie between 0 and 1")
-
-
-def _printer() -> Callable[[int, int, float, float], None]:
-    """Returns a callback that prints the progress, at first and then every INTERVAL."""
-    printed = -INTERVAL
-
-    def show(updates: int, total: int, td_error: float, seconds: float) -> None:
-        nonlocal printed
-        if time.monotonic() - printed >= INTERVAL or updates == total:
-            printed = time.monotonic()
-            left = datetime.timedelta(seconds=round(seconds * (total / updates - 1.0)))
-            text = f"{updates} of {total} updates, TD error {td_error:.3f}, {left} left"
-            print(text, flush=True)
-
-    return show

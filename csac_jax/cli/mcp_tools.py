@@ -40,12 +40,7 @@ def make(camera: CameraPolicy) -> MCPServer:
         """Decides where to grasp or push in a camera's image: the best `top` actions, in m and rad
         in the workspace's frame. All but `top` are paths of files, as of `csac-jax act`."""
         with _working():
-            image = (
-                image_files.read_rgb(Path(rgb)),
-                image_files.read_depth(Path(depth)),
-                image_files.read_intrinsics(Path(intrinsics)),
-                image_files.read_pose(Path(pose)),
-            )
+            image = image_files.read_image(*map(Path, (rgb, depth, intrinsics, pose)))
             return {"decisions": [one.to_dict() for one in camera.decide(*image, None, top)]}
 
     @server.tool(name="policies")

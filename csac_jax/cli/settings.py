@@ -34,6 +34,23 @@ VIEW: dict[str, tuple[str, ...]] = {"heightmap": (), "camera": (), "sensor": (),
 """Sections of a policy's view and hand, () or some of their settings; `train` has all."""
 
 
+@dataclasses.dataclass(frozen=True)
+class RunOptions:
+    """Options of commands that train."""
+
+    config: Path | None = None
+    """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
+    init: str | None = None
+    """Start from the networks of a run, a policy file or `shipped`; brings its net settings
+    and its heightmap.size."""
+    json: Path | None = None
+    """File to write the result to, as JSON."""
+    seed: int = 0
+    """Number that all randomness of the run follows from; of a sweep the first seed."""
+    algo: str = "csac_beta"
+    """Algorithm; settings given as options win over it."""
+
+
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     """Splits off the preset, if one stands first."""
     if arguments and not arguments[0].startswith("-"):

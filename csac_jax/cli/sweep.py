@@ -24,7 +24,7 @@ EXAMPLES = (
 
 
 @dataclasses.dataclass(frozen=True)
-class SweepOptions:
+class SweepOptions(settings.RunOptions):
     """Trains several seeds with several settings side by side in one program.
 
     --resume continues a sweep that was stopped. Every setting of a preset is an option."""
@@ -55,17 +55,6 @@ class SweepOptions:
     """Number of this process, from 0."""
     cluster: tyro.conf.FlagCreatePairsOff[bool] = False
     """Join the processes of a job of SLURM, Open MPI or Kubernetes, which JAX finds by itself."""
-    config: Path | None = None
-    """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
-    init: str | None = None
-    """Start from the networks of a run, a policy file or `shipped`; brings its net settings
-    and its heightmap.size."""
-    json: Path | None = None
-    """File to write the result to, as JSON."""
-    seed: int = 0
-    """The first seed."""
-    algo: str = "csac_beta"
-    """The algorithm. It changes settings of the preset; settings given as options win over it."""
 
 
 def run(arguments: list[str]) -> int:

@@ -24,7 +24,7 @@ MODULES = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"} 
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainOptions:
+class TrainOptions(settings.RunOptions):
     """Trains a policy into a new folder, or continues a run: --resume RUN."""
 
     run_dir: Path | None = None
@@ -33,11 +33,6 @@ class TrainOptions:
     """Folder of a run to continue; more --train.actions make it longer."""
     step: int | None = None
     """Checkpoint to resume from, by its step; the newest sound one if not given."""
-    config: Path | None = None
-    """File of settings, TOML, YAML or JSON, in place of a preset; a run's config.json too."""
-    init: str | None = None
-    """Start from the networks of a run, a policy file or `shipped`; brings its net settings
-    and its heightmap.size."""
     log: tuple[Literal["tensorboard", "wandb", "mlflow"], ...] = ()
     """Trackers that get every number, each needs the extra of its name."""
     eval_every: int = 0
@@ -46,12 +41,6 @@ class TrainOptions:
     """Suite of these evaluations, as of `csac-jax eval`."""
     eval_episodes: int = EVAL_EPISODES
     """Episodes of each part of that suite."""
-    json: Path | None = None
-    """File to write the result to, as JSON."""
-    seed: int = 0
-    """Number that all randomness of the run follows from."""
-    algo: str = "csac_beta"
-    """Algorithm; settings given as options win over it."""
 
 
 def run(arguments: list[str]) -> int:

@@ -39,8 +39,8 @@ UPDATES = 10  # of the critic in a step, after which the actor has one (ours)
 FEW = 100  # actions of a record (ours); docs/robot.md has what some hundred brought
 _AT_ONCE = 32  # transitions that are rewarded together: their maps fill the memory
 
-Progress = Callable[[int, int, float, float], None]
-"""Takes updates, all updates, mean abs(y - Q) in the step, and seconds since the first began."""
+Progress = Callable[[int, int, float], None]
+"""Takes updates, all updates, and mean abs(y - Q) in the step."""
 
 
 class Settings(NamedTuple):
@@ -176,7 +176,7 @@ def _learn(
             raise FailedError(
                 f"the loss is not finite after {updates} updates; lower learning_rate"
             )
-        on_progress(updates, total * UPDATES, errors[-1], time.perf_counter() - begun)
+        on_progress(updates, total * UPDATES, errors[-1])
     return jax.block_until_ready(state), errors, time.perf_counter() - begun
 
 

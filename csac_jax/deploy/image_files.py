@@ -59,6 +59,13 @@ def read_pose(path: Path) -> np.ndarray:
     return images.rigid(read_json(path, PoseBody).matrix, f"{path}: matrix")
 
 
+def read_image(
+    rgb: Path, depth: Path, intrinsics: Path, pose: Path
+) -> tuple[np.ndarray, np.ndarray, Intrinsics, np.ndarray]:
+    """Reads the first four arguments of `CameraPolicy.decide`, each from its file."""
+    return read_rgb(rgb), read_depth(depth), read_intrinsics(intrinsics), read_pose(pose)
+
+
 def read_json(path: Path, kind: Any) -> Any:
     """Reads JSON as a model or another type; errors name the key."""
     return _read(path, pydantic.TypeAdapter(kind).validate_json)

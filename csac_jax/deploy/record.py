@@ -80,14 +80,12 @@ class Entry(NamedTuple):
     @property
     def image(self) -> Image:
         """Reads the arguments of `CameraPolicy.decide`."""
-        mask = self.path / "mask.png"
-        return (
-            image_files.read_rgb(self.path / "rgb.png"),
-            image_files.read_depth(self.path / "depth.npy"),
-            image_files.read_intrinsics(self.path / "intrinsics.json"),
-            image_files.read_pose(self.path / "pose.json"),
-            image_files.read_mask(mask) if mask.exists() else None,
+        names, mask = (
+            ("rgb.png", "depth.npy", "intrinsics.json", "pose.json"),
+            self.path / "mask.png",
         )
+        image = image_files.read_image(*(self.path / name for name in names))
+        return (*image, image_files.read_mask(mask) if mask.exists() else None)
 
     @property
     def action(self) -> tuple[str, list[float]]:

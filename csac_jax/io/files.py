@@ -54,11 +54,13 @@ def replace(path: Path, content: str | bytes) -> None:
 
     A link in its place is replaced and its target stays.
     """
+    if isinstance(content, str):
+        content = content.encode(errors="backslashreplace")  # names that are no UTF-8
     path.parent.mkdir(parents=True, exist_ok=True)
     draft = path.with_name(_DRAFT.format(secrets.token_hex(8)))
     try:
         with draft.open("xb") as file:  # x follows no link
-            file.write(_encoded(content))
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())  # else a power failure may leave it empty
         draft.replace(path)
@@ -66,11 +68,6 @@ def replace(path: Path, content: str | bytes) -> None:
         with contextlib.suppress(OSError):
             draft.unlink(missing_ok=True)
         raise
-
-
-def _encoded(content: str | bytes) -> bytes:
-    """Encodes text; a name that is no UTF-8 appears with escapes."""
-    return content.encode(errors="backslashreplace") if isinstance(content, str) else content
 
 
 def append(path: Path, line: str) -> None:

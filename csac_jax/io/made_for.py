@@ -7,7 +7,7 @@ from csac_jax.config import Config
 from csac_jax.errors import DataWarning
 
 TASKS = {"clear": "take all", "target": "get a marked one", "both": "take all, or get a marked one"}
-ABOVE = "exact maps from above"
+ABOVE = "maps from above"
 
 
 def task(cfg: Config) -> str:

@@ -188,16 +188,11 @@ def evaluation(report: ResultReport) -> ResultTable:
             **_place_cells(score),
             "runs": str(score.most_runs),
             "episodes": str(score.episodes * sum(map(len, score.parts.values()))),
-            **metric_cells(score),
+            **{title: shown(score.band(key), metric=key) for key, title in METRICS.items()},
         }
         for whole in report.scores
         for score in whole.split()
     ]
-
-
-def metric_cells(score: Score) -> dict[str, str]:
-    """Returns the metrics of a score by their titles."""
-    return {title: shown(score.band(key), metric=key) for key, title in METRICS.items()}
 
 
 def differences(report: ResultReport) -> ResultTable:

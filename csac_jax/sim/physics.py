@@ -86,12 +86,16 @@ def start(
     scene: SceneState,
     height: jax.Array,
     action: Action,
-    valid: jax.Array | bool,
+    valid: jax.Array | bool = True,
+    background: bool = False,
 ) -> Started:
-    """Starts a primitive, see `act`. Warp runs it in the background: `finish` it before another one
-    of as many scenes starts."""
-    run = physics.start if isinstance(physics, warp_physics.WarpPhysics) else physics.run
-    return _started(run, cfg, scene, height, action, valid)
+    """Starts a primitive, see `act`. In the `background` Warp runs on: `finish` it before another
+    one of as many scenes starts."""
+    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
+    joints = primitives.joint_trajectory(cfg.sim, plan)
+    waits = not (background and isinstance(physics, warp_physics.WarpPhysics))
+    running = physics.run(scene, joints) if waits else physics.start(scene, joints)
+    return Started(scene, action, plan, joints.reachable, valid, running)
 
 
 def finish(physics: Physics, cfg: Config, started: Started, after: jax.Array) -> Motion:
@@ -106,7 +110,7 @@ def execute(
     physics: Physics, cfg: Config, scene: SceneState, height: jax.Array, action: Action
 ) -> tuple[SceneState, Trace, Plan]:
     """Runs a primitive over the map `height` [H, W] m; nothing moves if the robot cannot follow."""
-    started = _started(physics.run, cfg, scene, height, action, True)
+    started = start(physics, cfg, scene, height, action)
     return _followed(started, *started.running)
 
 
@@ -120,21 +124,8 @@ def act(
 ) -> Motion:
     """Runs a primitive, as `execute`, and takes lifted and lost blocks off the table. Undoes one
     that is not `valid` [] bool, that diverges or that is blocked."""
-    started = _started(physics.run, cfg, scene, height, action, valid)
+    started = start(physics, cfg, scene, height, action, valid)
     return _judged(cfg, started, *started.running)
-
-
-def _started(
-    run: Callable[[SceneState, JointTrajectory], Any],
-    cfg: Config,
-    scene: SceneState,
-    height: jax.Array,
-    action: Action,
-    valid: jax.Array | bool,
-) -> Started:
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, action, scene.fingers)
-    joints = primitives.joint_trajectory(cfg.sim, plan)
-    return Started(scene, action, plan, joints.reachable, valid, run(scene, joints))
 
 
 def _followed(started: Started, after: SceneState, trace: Trace) -> tuple[SceneState, Trace, Plan]:

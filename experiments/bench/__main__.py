@@ -18,9 +18,7 @@ BUILD = Path(__file__).resolve().parents[2] / "build"
 MAIN = {
     "step": ["quick"],
     "start": ["quick", "--runs", "1"],
-    "learner": ["quick"],
-    "act": ["--pixels", "64", "--states", "4", "--repeats", "3"],
-    "replay": ["12", "16"],
+    "replay": ["--largest", "16"],
     "sweep": ["quick", "--seeds", "1", "4"],
     "objects": [],
     "parity": ["--primitives", "64", "--poses", "8"],
@@ -28,10 +26,8 @@ MAIN = {
 """Benchmark -> its arguments."""
 PARTS = ("first_action", "first_action_cached", "success", "end")  # of `start`
 FIGURES = {
-    "step": ("actions_per_second", "step_seconds", "compile_seconds.cached.compile"),
+    "step": ("actions_per_second", "step_seconds"),
     "start": tuple(f"median.this.{part}" for part in PARTS),
-    "learner": ("peak_gflop_per_second", "parts.forward.share_of_peak"),
-    "act": ("densenet121.0.seconds_per_state", "small.quick.times.0.seconds_per_state"),
     "replay": ("capacities.0.median_seconds.beta", "capacities.4.median_seconds.beta"),
     "sweep": ("rows.0.actions_per_second", "rows.1.actions_per_second"),
     "objects": ("milliseconds.blocks action", "over_blocks.objects action"),

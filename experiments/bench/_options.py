@@ -20,19 +20,36 @@ class Parser(argparse.ArgumentParser):
         raise SettingsError(f"{self.prog}: {message}")
 
 
-def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
-    """Parses whole numbers of at least 1, and switches, whose default is False."""
+def _numbers(name: str, defaults: dict[str, int]) -> Parser:
     parser = Parser(prog=f"bench {name}", allow_abbrev=False)
     for option, default in defaults.items():
         if default is False:
             parser.add_argument(f"--{option}", action="store_true")
         else:
             parser.add_argument(f"--{option}", type=int, default=default)
-    options = vars(parser.parse_args(arguments))
-    for option, value in options.items():
+    return parser
+
+
+def _checked(parser: Parser, options: argparse.Namespace) -> dict[str, int]:
+    for option, value in vars(options).items():
         if value < 1 and value is not False:
             parser.error(f"--{option}: must be at least 1")
-    return options
+    return vars(options)
+
+
+def read(name: str, arguments: list[str], **defaults: int) -> dict[str, int]:
+    """Parses whole numbers of at least 1, and switches, whose default is False."""
+    parser = _numbers(name, defaults)
+    return _checked(parser, parser.parse_args(arguments))
+
+
+def read_preset(
+    name: str, arguments: list[str], **defaults: int
+) -> tuple[str, dict[str, int], list[str]]:
+    """Parses as `read`; also returns the preset, `quick` if none is given, and the settings."""
+    parser = _numbers(name, defaults)
+    preset, options, flags = split(parser, arguments)
+    return preset, _checked(parser, options), flags
 
 
 def emit(result: dict[str, Any]) -> None:

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import statistics
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from csac_jax.io import policy_file
 from csac_jax.runtime import processes
 from examples import camera_image
 from experiments.bench._options import timed
+from experiments.bench._timing import seconds
 
 LOOKS = {"one look": False, "four looks": True}
 
@@ -29,10 +29,8 @@ def image() -> tuple[Any, ...]:
     """Draws the image of a camera: colour, depth, intrinsics and pose."""
     with tempfile.TemporaryDirectory() as folder:
         camera_image.main(folder)
-        at = Path(folder)
-        rgb, depth = image_files.read_rgb(at / "rgb.png"), image_files.read_depth(at / "depth.png")
-        lens = image_files.read_intrinsics(at / "intrinsics.json")
-        return rgb, depth, lens, image_files.read_pose(at / "pose.json")
+        names = ("rgb.png", "depth.png", "intrinsics.json", "pose.json")
+        return image_files.read_image(*(Path(folder, name) for name in names))
 
 
 def measure(repeats: int) -> dict[str, Any]:
@@ -46,16 +44,8 @@ def measure(repeats: int) -> dict[str, Any]:
             calls[name, looks, "image"] = functools.partial(policy.decide, *seen)
             decide = functools.partial(policy.decide_each, [view], [1], only_target=False)
             calls[name, looks, "view"] = decide
-    seconds: dict[Any, list[float]] = {key: [] for key in calls}
-    for call in calls.values():
-        call()
-    for _ in range(repeats):
-        for key, call in calls.items():
-            begun = time.perf_counter()
-            call()
-            seconds[key].append(time.perf_counter() - begun)
     rows = []
-    for key, times in seconds.items():
+    for key, times in seconds(calls, repeats).items():
         named = dict(zip(("policy", "looks", "given"), key, strict=True))
         rows.append(
             named | {"least_ms": 1e3 * min(times), "median_ms": 1e3 * statistics.median(times)}

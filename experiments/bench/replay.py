@@ -1,5 +1,5 @@
-"""Speed of the replay, as JSON: `csac-jax bench replay [SMALLEST LARGEST]`, capacities 2^SMALLEST
-(12) to 2^LARGEST (20).
+"""Speed of the replay, as JSON: `csac-jax bench replay [--smallest N] [--largest N]`, capacities
+2^SMALLEST (12) to 2^LARGEST (20).
 
 One step draws 64 transitions from a full ring with their weights, gathers them and replaces their
 priorities. The samplers of this package stand beside flashbax's prioritised item buffer, with the
@@ -9,8 +9,8 @@ alike, and the median is reported. An item is 21 numbers: the loops time the sam
 copying of images.
 """
 
+import itertools
 import statistics
-import time
 from collections.abc import Callable
 from typing import Any
 from unittest import mock
@@ -18,10 +18,12 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 
+from csac_jax.cli import failures
 from csac_jax.config import BetaReplay, PrioritisedReplay, ReplayConfig, UniformReplay
 from csac_jax.errors import SettingsError
 from csac_jax.replay import ring, samplers
-from experiments.bench._options import emit
+from experiments.bench._options import emit, read
+from experiments.bench._timing import seconds
 
 BATCH = 64
 REPEATS = 31
@@ -85,13 +87,8 @@ def _flashbax(capacity: int) -> tuple[Any, Step]:
     return state, step
 
 
-def _sorting(capacity: int, steps: int) -> Callable[[], float]:
-    with mock.patch.object(samplers, "SORTED", capacity):  # read as the program is traced
-        return _timer(*_ours(BetaReplay(capacity=capacity)), steps)
-
-
-def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
-    """Returns a function that runs `steps` more steps and returns the seconds per step."""
+def _loop(state: Any, step: Step, steps: int) -> Callable[[], Any]:
+    """Returns a function that runs `steps` more steps."""
 
     def loop(state: Any, key: jax.Array) -> Any:
         return jax.lax.scan(
@@ -99,69 +96,54 @@ def _timer(state: Any, step: Step, steps: int) -> Callable[[], float]:
         )[0]
 
     compiled = jax.jit(loop, donate_argnums=0)
-    current = jax.block_until_ready(compiled(jax.tree.map(jnp.copy, state), jax.random.key(1)))
-    calls = 0
+    current, numbers = jax.tree.map(jnp.copy, state), itertools.count()
 
-    def call() -> float:
-        nonlocal current, calls
-        calls += 1
-        key = jax.random.key(1 + calls)
-        begun = time.perf_counter()
-        current = jax.block_until_ready(compiled(current, key))
-        return (time.perf_counter() - begun) / steps
+    def call() -> Any:
+        nonlocal current
+        current = compiled(current, jax.random.key(next(numbers)))
+        return current
 
     return call
 
 
 def measure(capacity: int) -> dict[str, Any]:
     """Measures median seconds per step for one capacity."""
-    exact, sorting = capacity <= samplers.SORTED, max(SORTED // capacity, 1)
-    timers = {
-        "uniform": _timer(*_ours(UniformReplay(capacity=capacity)), STEPS),
-        "prioritised": _timer(*_ours(PrioritisedReplay(capacity=capacity)), STEPS),
-        "beta": _timer(*_ours(BetaReplay(capacity=capacity)), sorting if exact else STEPS),
-        "beta_sorted": _sorting(capacity, sorting),
-        "flashbax": _timer(*_flashbax(capacity), STEPS),
+    sorting = max(SORTED // capacity, 1)
+    steps = dict.fromkeys(("uniform", "prioritised", "beta", "flashbax"), STEPS)
+    steps |= {"beta_sorted": sorting}
+    if capacity <= samplers.SORTED:
+        steps["beta"] = sorting
+    loops = {
+        "uniform": _ours(UniformReplay(capacity=capacity)),
+        "prioritised": _ours(PrioritisedReplay(capacity=capacity)),
+        "beta": _ours(BetaReplay(capacity=capacity)),
+        "flashbax": _flashbax(capacity),
     }
-    seconds: dict[str, list[float]] = {name: [] for name in timers}
-    for _ in range(REPEATS):
-        for name, timer in timers.items():
-            seconds[name].append(timer())
-    median = {name: statistics.median(values) for name, values in seconds.items()}
+    calls = {name: _loop(*loop, steps[name]) for name, loop in loops.items()}
+    calls["beta_sorted"] = _loop(*loops["beta"], sorting)
+    with mock.patch.object(samplers, "SORTED", capacity):  # read as the program is traced
+        jax.block_until_ready(calls["beta_sorted"]())
+    times = seconds(calls, REPEATS)
+    median = {name: statistics.median(values) / steps[name] for name, values in times.items()}
     return {
         "capacity": capacity,
         "median_seconds": median,
-        "least_seconds": {name: min(values) for name, values in seconds.items()},
+        "least_seconds": {name: min(values) / steps[name] for name, values in times.items()},
         "flashbax_over_prioritised": median["flashbax"] / median["prioritised"],
     }
 
 
-def _exponents(arguments: list[str]) -> range:
-    if not arguments:
-        return range(12, 21)
-    if len(arguments) != 2 or not all(word.isdigit() for word in arguments):
-        raise SettingsError(
-            "bench replay: give two exponents of 2, the smallest and the largest capacity, or none"
-        )
-    smallest, largest = map(int, arguments)
+def main(arguments: list[str]) -> None:
+    """Prints the result. Raises SettingsError for rings that are smaller than a batch."""
+    exponents = read("replay", arguments, smallest=12, largest=20)
+    smallest, largest = exponents.values()
     if not BATCH <= 2**smallest <= 2**largest <= 2**24:
         raise SettingsError("bench replay: exponents must lie in 6 .. 24, the smaller first")
-    return range(smallest, largest + 1)
-
-
-def main(arguments: list[str]) -> None:
-    """Prints the result."""
-    exponents = _exponents(arguments)
-    try:
-        import flashbax  # noqa: F401
-    except ImportError:
-        raise SettingsError(
-            "bench replay needs flashbax; run: pip install 'csac-jax[bench]'"
-        ) from None
+    failures.check_extra("bench replay", "flashbax", "bench")
     result = {
         "batch": BATCH,
         "item": {name: f"{leaf.dtype}{list(leaf.shape)}" for name, leaf in ITEM.items()},
         "repeats": REPEATS,
-        "capacities": [measure(2**exponent) for exponent in exponents],
+        "capacities": [measure(2**exponent) for exponent in range(smallest, largest + 1)],
     }
     emit(result)

@@ -1,34 +1,31 @@
 """Times how soon a run learns, as JSON: `csac-jax bench start [PRESET] [--runs 5] [--other
-CHECKOUT] [--cores N] [SETTINGS]`.
+CHECKOUT] [SETTINGS]`.
 
 Each run is a process of `csac-jax train PRESET SETTINGS` with an empty cache, which goes to its
 end, and another of the same config, stopped at its first action, which finds what the first has
 cached. Runs of this checkout and of another one take turns, so that what else the machine does hits
 both alike. Times are from the start of the process, s; seed i is run i. The first action begins as
-the program is compiled. With --cores, on Linux, every seed has N cores of its own, and as many
-seeds run side by side as the machine has such cores for.
+the program is compiled.
 
 Parts: `first_action` with an empty cache, `first_action_cached`, `success` when 90 % of the last
 200 grasps lift a block, `end`. The last two leave out what the host does between chunks.
 """
 
+import itertools
 import json
 import os
-import queue
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import csac_jax
 from csac_jax.errors import SettingsError
-from csac_jax.runtime import provenance
-from experiments.bench import _options
+from experiments.bench._options import Parser, emit, split
 
 HERE = Path(csac_jax.__file__).parents[1]
 GRASPS, SHARE = 200, 0.9  # that the run is waited for
@@ -36,62 +33,32 @@ GRASPS, SHARE = 200, 0.9  # that the run is waited for
 
 def main(arguments: Sequence[str] = ()) -> None:
     """Prints the result."""
-    parser = _options.Parser(prog="bench start", allow_abbrev=False)
+    parser = Parser(prog="bench start", allow_abbrev=False)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--other", type=Path)
-    parser.add_argument("--cores", type=int)
-    preset, options, flags = _options.split(parser, list(arguments))
+    preset, options, flags = split(parser, list(arguments))
     checkouts = {"this": HERE}
     if options.other is not None:
         if not (options.other / "csac_jax").is_dir():
             raise SettingsError(f"bench start: --other: {options.other} is no checkout")
         checkouts["other"] = options.other.resolve()
-    shares = _shares(options.cores)[: options.runs]
-    print(json.dumps(measure([preset, *flags], options.runs, checkouts, shares), indent=2))
+    emit(measure([preset, *flags], options.runs, checkouts))
 
 
-def _shares(cores: int | None) -> list[set[int]]:
-    """Sets of so many cores each, none in two; None is one empty set, for any core."""
-    if cores is None:
-        return [set()]
-    every = sorted(os.sched_getaffinity(0))
-    if not 1 <= cores <= len(every):
-        raise SettingsError(f"bench start: --cores: must be from 1 to {len(every)}")
-    firsts = range(0, len(every) - cores + 1, cores)
-    return [set(every[first : first + cores]) for first in firsts]
-
-
-def measure(
-    train: list[str], runs: int, checkouts: dict[str, Path], shares: list[set[int]]
-) -> dict[str, Any]:
+def measure(train: list[str], runs: int, checkouts: dict[str, Path]) -> dict[str, Any]:
     """Times of every run by checkout, their medians, and how many times sooner this one is."""
-    free: queue.SimpleQueue[set[int]] = queue.SimpleQueue()
-    for share in shares:
-        free.put(share)
-
-    def one(seed: int) -> dict[str, dict[str, Any]]:
-        share = free.get()
-        if share:  # of this thread, and so of the processes that it starts
-            os.sched_setaffinity(0, share)
-        found = {}
-        for name, checkout in checkouts.items():
-            found[name] = _run(train, seed, checkout)
-            print(f"{name} {seed}: {found[name]}", file=sys.stderr)
-        free.put(share)
-        return found
-
-    with ThreadPoolExecutor(len(shares)) as threads:
-        seeds = list(threads.map(one, range(runs)))
-    every = {name: [found[name] for found in seeds] for name in checkouts}
+    every: dict[str, list[dict[str, Any]]] = {name: [] for name in checkouts}
+    for seed, (name, checkout) in itertools.product(range(runs), checkouts.items()):
+        every[name].append(_run(train, seed, checkout))
+        print(f"{name} {seed}: {every[name][-1]}", file=sys.stderr)
     median = {name: _median(times) for name, times in every.items()}
     result: dict[str, Any] = {"train": train, "runs": every, "median": median}
-    result |= {"cores": len(shares[0]) or None, "side_by_side": len(shares)}
     if other := median.get("other"):
         pairs = {part: (other[part], after) for part, after in median["this"].items()}
         result["times_sooner"] = {
             part: a / b if a and b else None for part, (a, b) in pairs.items()
         }
-    return result | {"load": os.getloadavg()} | provenance.record()
+    return result | {"load": os.getloadavg()}
 
 
 def _median(times: list[dict[str, Any]]) -> dict[str, Any]:

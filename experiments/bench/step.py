@@ -1,44 +1,35 @@
-"""Times the stages of a training step, as JSON: `csac-jax bench step [PRESET] [--physics
-mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`, PRESET `quick` if none is given, physics
-`auto`, settings as `csac-jax train` takes them: `--learn.updates_per_step 64`.
+"""Times the stages of a training step, as JSON: `csac-jax bench step [PRESET] [--steps N]
+[--repeats N] [SETTING ...]`, PRESET `quick` if none is given, settings as `csac-jax train` takes
+them: `--learn.updates_per_step 64`.
 
 Each stage of `train_step` is compiled by itself. It is timed beside the whole step, a compiled loop
-of STEPS (2) steps as in training, and beside a bare loop of the engine's own steps of the same
-scenes and set-points. Calls take turns in one process, and the median of REPEATS (5) rounds counts,
-so other load slows all alike. Trust ratios.
+of STEPS (2) steps as in training. Calls take turns in one process, and the median of REPEATS (5)
+rounds counts, so other load slows all alike. Trust ratios. `bench start` times compilation with a
+filled cache.
 """
 
-import argparse
-import contextlib
 import functools
 import itertools
 import resource
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental.compilation_cache import compilation_cache
 
 from csac_jax.agent import policy, values
 from csac_jax.agent.csac import CSAC
 from csac_jax.agent.learner import Transition
-from csac_jax.cli import parsing
-from csac_jax.config import Config, PhysicsKind
-from csac_jax.errors import SettingsError
+from csac_jax.config import Config
 from csac_jax.replay import ring
 from csac_jax.robot.primitives import Action
-from csac_jax.runtime import cache, compiler
+from csac_jax.runtime import compiler
 from csac_jax.sim import backend
 from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.vision import heightmap
-from experiments.bench import _bare
-from experiments.bench._options import Parser, config, emit, split
+from experiments.bench._options import config, emit, read_preset
 from experiments.bench._timing import medians
-
-_SEPARATE = ("dense_maps", "act", "simulate", "reward", "remember", "learn", "replace")
 
 
 def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, float]]:
@@ -53,38 +44,6 @@ def _compile(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[s
     if isinstance(compiled, split_step.Chunk):
         compiled.learn.result()  # waits for it
     return compiled, {"trace": traced - begun, "compile": time.perf_counter() - traced}
-
-
-@contextlib.contextmanager
-def _fresh_cache() -> Iterator[None]:
-    """Replaces the user's cache of compiled programs by an empty one."""
-    names = (
-        "jax_compilation_cache_dir",
-        "jax_enable_compilation_cache",
-        "jax_persistent_cache_min_compile_time_secs",
-    )
-    before = {name: getattr(jax.config, name) for name in names}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, value in zip(names, (folder, True, 0.0), strict=True):
-            jax.config.update(name, value)
-        compilation_cache.reset_cache()
-        cache.enable()  # counts hits
-        try:
-            yield
-        finally:
-            for name, value in before.items():
-                jax.config.update(name, value)
-            compilation_cache.reset_cache()
-
-
-def _compile_twice(program: step.Program, state: Any, steps: int) -> tuple[Any, dict[str, Any]]:
-    """Compiles a chunk with an empty cache, then with a filled one; traces it both times."""
-    with _fresh_cache():
-        _, cold = _compile(program, state, steps)
-        jax.clear_caches()
-        hits = cache.hits()
-        chunk, cached = _compile(program, state, steps)
-        return chunk, {"cold": cold, "cached": cached, "found_in_cache": cache.hits() > hits}
 
 
 def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable[[], Any]]:
@@ -143,7 +102,6 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         replay = run["remember"](replay, scenes, action, after)
         return replay.head
 
-    bare = _bare.joint_trajectories(cfg, scenes.obs.height, action)
     return {
         "dense_maps": lambda: run["dense_maps"](nets.online, scenes.obs),
         "act": lambda: run["act"](next(numbers), maps, scenes.steps_without_change),
@@ -152,7 +110,6 @@ def _stages(program: step.Program, state: step.TrainState) -> dict[str, Callable
         "remember": remember_again,
         "learn": lambda: run["learn"](next(numbers), nets, filled),
         "replace": lambda: run["replace"](next(numbers), after),
-        "bare_loop": _bare.loop(env.physics, scenes.scene, bare),
     }
 
 
@@ -166,14 +123,6 @@ def _whole(chunk: Any, cfg: Config, state: step.TrainState) -> Callable[[], Any]
         return metrics
 
     return call
-
-
-def _rates(cfg: Config, seconds: float) -> dict[str, float]:
-    return {
-        "actions_per_second": cfg.train.scenes / seconds,
-        "physics_steps_per_second": cfg.train.scenes * cfg.sim.substeps / seconds,
-        "updates_per_second": cfg.learn.updates_per_step / seconds,
-    }
 
 
 def _memory(chunk: Any) -> dict[str, int | None]:
@@ -192,56 +141,29 @@ def measure(cfg: Config, steps: int, repeats: int) -> dict[str, Any]:
     """Times one config's step and its stages."""
     program = programs.make(cfg)
     state = programs.init(program)
-    chunk, compiling = _compile_twice(program, state, steps)
+    chunk, compiling = _compile(program, state, steps)
     calls = _stages(program, state)
     calls["whole"] = _whole(chunk, cfg, jax.tree.map(jnp.copy, state))  # it uses it up
     seconds = medians(calls, repeats)
-    whole, bare = seconds["whole"] / steps, seconds["bare_loop"]
-    stages = {name: seconds[name] for name in _SEPARATE}
-    total = sum(stages.values())
+    whole = seconds.pop("whole") / steps
+    total = sum(seconds.values())
     return {
-        "stage_seconds": stages,
-        "stage_shares": {name: value / total for name, value in stages.items()},
+        "stage_seconds": seconds,
+        "stage_shares": {name: value / total for name, value in seconds.items()},
         "step_seconds": whole,
         "sum_of_stages_over_step": total / whole,
-        **_rates(cfg, whole),
-        "bare_loop_seconds": bare,
-        "bare_loop_over_simulate": bare / stages["simulate"],
-        "bare_loop_over_step": bare / whole,
+        "actions_per_second": cfg.train.scenes / whole,
+        "physics_steps_per_second": cfg.train.scenes * cfg.sim.substeps / whole,
+        "updates_per_second": cfg.learn.updates_per_step / whole,
         "compile_seconds": compiling,
         **_memory(chunk),
     }
 
 
-def _parse(arguments: list[str]) -> tuple[str, argparse.Namespace, list[str]]:
-    parser = Parser(prog="bench step", allow_abbrev=False)
-    parser.add_argument("--physics", choices=("mjx", "warp", "c", "auto"))
-    for name, default in {"steps": 2, "repeats": 5}.items():
-        parser.add_argument(f"--{name}", type=int, default=default)
-    preset, options, flags = split(parser, arguments)
-    if min(options.steps, options.repeats) < 1:
-        parser.error("--steps, --repeats: at least 1")
-    return preset, options, flags
-
-
-def _config(preset: str, flags: list[str], physics: PhysicsKind | None) -> Config:
-    cfg = config("step", preset, flags)
-    if physics is None:
-        physics = cfg.sim.physics if parsing.take(flags, "--sim.physics")[0] else "auto"
-    if physics == "warp":
-        cfg = cfg.change(scene={"size_jitter": (cfg.scene.size_jitter[0], 0.0)})
-    return backend.resolve(cfg.change(sim={"physics": physics}))
-
-
 def main(arguments: list[str]) -> None:
     """Prints the result."""
-    preset, options, flags = _parse(arguments)
-    steps, repeats = options.steps, options.repeats
-    try:
-        cfg = _config(preset, flags, options.physics)
-    except ValueError as error:
-        raise SettingsError(f"bench step: {error}") from None
+    preset, numbers, flags = read_preset("step", arguments, steps=2, repeats=5)
+    cfg = backend.resolve(config("step", preset, flags))
     result = {"preset": preset, "settings": flags, "physics": cfg.sim.physics}
-    result |= {"scenes": cfg.train.scenes, "steps": steps, "repeats": repeats}
-    result |= {"substeps": cfg.sim.substeps, "updates": cfg.learn.updates_per_step}
-    emit(result | measure(cfg, steps, repeats))
+    result |= {"scenes": cfg.train.scenes, "substeps": cfg.sim.substeps, **numbers}
+    emit(result | {"updates": cfg.learn.updates_per_step} | measure(cfg, **numbers))

@@ -27,7 +27,7 @@ from csac_jax.sim import backend
 from csac_jax.sweeps import replicas
 from csac_jax.training import programs, sharding
 from csac_jax.training.step import Program
-from experiments.bench._options import Parser, config, emit, split
+from experiments.bench._options import config, emit, read_preset
 
 KINDS = {  # the first that a kernel's name holds
     "exchanges": r"nccl|all.?reduce|all.?gather",
@@ -90,20 +90,12 @@ def _shard(seeds: int) -> sharding.Shard:
 def main(arguments: list[str]) -> None:
     """Prints the result. Raises SettingsError for devices that are not there, or do not divide
     the scenes or the seeds."""
-    parser = Parser(prog="bench step_kernels", allow_abbrev=False)
-    for name in ("--devices", "--seeds"):
-        parser.add_argument(name, type=int, default=1)
-    preset, options, flags = split(parser, arguments)
+    preset, numbers, flags = read_preset("step_kernels", arguments, devices=1, seeds=1)
+    devices, seeds = numbers["devices"], numbers["seeds"]
     cfg = config("step_kernels", preset, flags).change(train={"chunk": 1})
-    seeds = options.seeds
-    if seeds < 1:
-        raise SettingsError("bench step_kernels: --seeds: at least 1")
-    cfg = backend.resolve(cfg, options.devices, seeds)
-    try:
-        mesh = sharding.make(options.devices)
-        sharding.check(mesh, _shard(seeds), seeds, cfg.train.scenes, cfg.learn.batch)
-    except ValueError as error:
-        raise SettingsError(f"bench step_kernels: {error}") from None
+    cfg = backend.resolve(cfg, devices, seeds)
+    mesh = sharding.make(devices)
+    sharding.check(mesh, _shard(seeds), seeds, cfg.train.scenes, cfg.learn.batch)
     cache.enable()
     state, chunk = _compiled(programs.make(cfg), mesh, seeds)
     for _ in range(2):
@@ -113,5 +105,4 @@ def main(arguments: list[str]) -> None:
         with jax.profiler.trace(folder):
             jax.block_until_ready(chunk(state))
         found = table(_traced(Path(folder)))
-    sizes = {"preset": preset, "devices": options.devices, "seeds": seeds, "settings": flags}
-    emit({**sizes, **found})
+    emit({"preset": preset, **numbers, "settings": flags, **found})

@@ -1,7 +1,6 @@
 """Times seeds side by side, as JSON: `csac-jax bench sweep [PRESET] [--seeds 1 4 16] [--devices
-1 ...] [--shard seeds|scenes] [--physics mjx|warp|c|auto] [--steps N] [--repeats N] [SETTING ...]`,
-PRESET `quick` if none is given, physics the preset's, settings as `csac-jax train` takes them:
-`--train.scenes 64`.
+1 ...] [--shard seeds|scenes] [--steps N] [--repeats N] [SETTING ...]`, PRESET `quick` if none is
+given, settings as `csac-jax train` takes them: `--train.scenes 64`.
 
 For every number of devices and of seeds, the compiled loop of STEPS (2) training steps of all of
 them: its compilation and the median of REPEATS (3) rounds after one that is not timed. With --shard
@@ -21,8 +20,6 @@ from typing import Any
 
 import jax
 
-from csac_jax.config import Config
-from csac_jax.errors import SettingsError
 from csac_jax.runtime import compiler
 from csac_jax.sim import backend
 from csac_jax.sweeps import grid, replicas, runner
@@ -60,36 +57,24 @@ def measure(
     return {"seeds": seeds, "devices": devices, "parts": parts, **row, "actions_per_second": rate}
 
 
-def _config(preset: str, flags: list[str], options: Any) -> Config:
-    cfg = config("sweep", preset, flags)
-    sim = dataclasses.replace(cfg.sim, physics=options.physics or cfg.sim.physics)
-    return backend.resolve(
-        dataclasses.replace(cfg, sim=sim), max(options.devices), max(options.seeds)
-    )
-
-
 def main(arguments: list[str]) -> None:
     """Prints the result. Raises SettingsError for what cannot be measured."""
     parser = Parser(prog="bench sweep", description=__doc__, allow_abbrev=False)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--devices", type=int, nargs="+", default=[1])
     parser.add_argument("--shard", choices=["seeds", "scenes"], default="seeds")
-    parser.add_argument("--physics", choices=["mjx", "warp", "c", "auto"])
     for name, default in (("steps", 2), ("repeats", 3)):
         parser.add_argument(f"--{name}", type=int, default=default)
     preset, options, flags = split(parser, arguments)
     if min(*options.seeds, options.steps, options.repeats) < 1:
-        raise SettingsError("bench sweep: --seeds, --steps, --repeats: at least 1")
-    try:
-        cfg = _config(preset, flags, options)
-        for devices in options.devices:
-            sharding.check(
-                sharding.make(devices), options.shard, 0, cfg.train.scenes, cfg.learn.batch
-            )
-            most = runner.SweepPlan(max(options.seeds), [grid.SweepPoint("base", {}, cfg)])
-            runner.check_room(most, 1 if options.shard == "scenes" else devices)
-    except ValueError as error:
-        raise SettingsError(f"bench sweep: {error}") from None
+        parser.error("--seeds, --steps, --repeats: at least 1")
+    most_devices, most_seeds = max(options.devices), max(options.seeds)
+    cfg = backend.resolve(config("sweep", preset, flags), most_devices, most_seeds)
+    for devices in options.devices:
+        mesh = sharding.make(devices)
+        sharding.check(mesh, options.shard, 0, cfg.train.scenes, cfg.learn.batch)
+        most = runner.SweepPlan(most_seeds, [grid.SweepPoint("base", {}, cfg)])
+        runner.check_room(most, 1 if options.shard == "scenes" else devices)
     program, steps, repeats = programs.make(cfg), options.steps, options.repeats
     alone = None
     if 1 in options.seeds and 1 in options.devices:

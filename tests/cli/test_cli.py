@@ -375,7 +375,8 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "arguments", ["start smoke --runs 1 --cores 1", "replay 6 7", "step smoke --repeats 1"]
+    "arguments",
+    ["start smoke --runs 1", "replay --smallest 6 --largest 7", "step smoke --repeats 1"],
 )
 def test_benchmarks_run(capfd: pytest.CaptureFixture, arguments: str):
     """Claim: the benchmarks print JSON with times and provenance."""

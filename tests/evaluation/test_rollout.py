@@ -234,7 +234,7 @@ def test_oracle_beats_random_in_physics():
     ("change", "text"),
     [
         ({"sim": {"gripper": "franka_hand"}}, "hand rg2, not franka_hand: expect less"),
-        ({"heightmap": {"view": "oblique"}}, "view exact maps from above, not exact images of an"),
+        ({"heightmap": {"view": "oblique"}}, "view maps from above, not exact images of an"),
         ({"task": {"kind": "target"}}, "task take all, not get a marked one"),
         ({"scene": {"slots": ("object",) * 5, "objects": "x"}}, "with blocks, not objects of"),
         ({"train": {"scenes": 1}, "sim": {"physics": "c"}}, None),

@@ -184,6 +184,11 @@ class Run:
         """Returns the number of a step's folder, which it keeps where it is moved."""
         return (self.path / checkpoint.FOLDER / str(step)).stat().st_ino
 
+    def drafts(self) -> set[tuple[Path, int]]:
+        """Returns the half-written files and folders, each with its inode."""
+        found = [path for path in self.path.rglob("*") if DRAFTS.search(path.name)]
+        return {(path, path.stat().st_ino) for path in found}
+
     def judge(self, tally: Tally, about: str) -> None:
         """Counts what is lost or wrong of a run."""
         with warnings.catch_warnings(record=True) as told:
@@ -351,6 +356,7 @@ def kill(life: Life) -> None:
 def fill_disc(life: Life) -> None:
     """Lets files grow to some size only, from a moment of a training on."""
     run, limits = life.run_or_new(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = run.drafts()
     largest = int(10 ** life.rng.uniform(0.0, 4.0)) - 1
     full = lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (largest, limits[1]))  # noqa: E731
     try:
@@ -358,8 +364,8 @@ def fill_disc(life: Life) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     run.judge(life.tally, life.about())
-    left = [path for path in run.path.rglob("*") if DRAFTS.search(path.name)]
-    life.tally.check(not left, "lost", f"{life.about()}: left {left}")
+    left = run.drafts() - before
+    life.tally.check(not left, "lost", f"{life.about()}: left {sorted(left)}")
 
 
 def two_at_once(life: Life) -> None:
@@ -424,7 +430,7 @@ def move(life: Life) -> None:
 def upgrade(life: Life) -> None:
     """Turns the newest checkpoint into one of a former version."""
     for run in [run for run in life.runs if run.sound][:1]:
-        folder = run.path / checkpoint.FOLDER / str(max(run.sound))
+        folder = checkpoint.sound(run.path)
         record = folder / "extra" / "metadata"
         content = json.loads(record.read_text())
         for name in ("run", "step", "versions"):

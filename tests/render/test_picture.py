@@ -5,12 +5,15 @@ import os
 import subprocess
 import sys
 
+import jax
 import mujoco
 import numpy as np
 import pytest
 
+from csac_jax.config import SceneConfig, SimConfig
 from csac_jax.render import gl, picture
 from csac_jax.render.picture import Viewpoint
+from csac_jax.world import model as world_model, scene_state
 
 BALL = """
 <mujoco>
@@ -56,9 +59,9 @@ def test_rays_show_what_stands_where():
     assert green[0] < red[0]  # the taller one
 
 
-def test_rays_shade_flat_and_round_geoms_have_sides():
-    """Claim: a pixel is its geom's colour times a brightness by the normal, or white; a round geom
-    is as wide and as high as in MuJoCo; a geom without a shape of ours is refused."""
+def test_rays_shade_by_the_normal():
+    """Claim: a pixel is its geom's colour times a brightness by the normal, or white; a box has a
+    brightness for each side that is seen, a round geom many."""
     sizes = {"box": "0.1 0.1 0.1", "sphere": "0.1", "ellipsoid": "0.1 0.2 0.05"}
     sizes |= dict.fromkeys(("cylinder", "capsule"), "0.1 0.2")
     geoms = "".join(
@@ -73,14 +76,31 @@ def test_rays_shade_flat_and_round_geoms_have_sides():
     seen = drawn[drawn.min(axis=1) < 255].astype(float)
     np.testing.assert_allclose(seen[:, 0] / seen[:, 1], 0.5, atol=0.02)
     number = np.round(10.0 * (0.4 * seen[:, 2] / seen[:, 1] - 0.4)).astype(int)
-    for i, high in enumerate((0.1, 0.1, 0.05, 0.2, 0.3)):
+    for i in range(len(sizes)):
         assert 15 < (number == i).sum() < 1500
         faces = len(np.unique(seen[number == i, 1]))
         assert faces <= 3 if i == 0 else faces >= 3  # a box shows no more
-        top = np.abs(picture._corners(model, i)).max(axis=0)[2]
-        assert top == pytest.approx(high, rel=0.05)
-    with pytest.raises(ValueError, match="rays do not draw its type"):
-        picture._corners(mujoco.MjModel.from_xml_string(BALL), 0)  # a plane
+
+
+def test_rays_show_scaled_meshes_whole():
+    """Claim: rays see every triangle of a block that is smaller than it was compiled: from above,
+    the picture of a half cylinder is one piece without holes."""
+    scene_cfg = SceneConfig(slots=("half_cylinder",), min_blocks=1)
+    world = world_model.build(scene_cfg, SimConfig(physics="c"))
+    scene = scene_state.parked(scene_cfg.slots)
+    scene = scene.replace(position=np.float32([[0.0, 0.0, 0.0125]]), in_play=np.ones(1, bool))
+    fields = jax.device_get(world_model.scene_fields(world, scene))
+    model = picture.coloured(world, fields, scene)
+    data = mujoco.MjData(model)
+    data.qpos[world.block_qpos[0]] = [0.0, 0.0, 0.0125, 1.0, 0.0, 0.0, 0.0]
+    data.qpos[world.robot_qpos[2]] = 5.0
+    mujoco.mj_kinematics(model, data)
+    above = Viewpoint(position=(-0.02, 0.0, 0.2), look_at=(0.0, 0.0, 0.0), size=(96, 96))
+    drawn = picture.renderer(model, above, None)(data).astype(int)
+    seen = np.abs(drawn - drawn[0, 0]).max(axis=2) > 20
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    assert len(rows) > 20
+    assert seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].mean() > 0.98
 
 
 def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
@@ -92,7 +112,7 @@ def _where(drawn: np.ndarray, channel: int) -> np.ndarray:
 
 
 def test_both_ways_of_drawing_agree():
-    """Claim: MuJoCo's renderer and our rays show the same to the pixel, under a white sky."""
+    """Claim: MuJoCo's renderer and its rays show the same to the pixel, under a white sky."""
     command = [sys.executable, "-c", _BOTH]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     if done.returncode == 3:

@@ -19,6 +19,7 @@ from scipy import stats
 from csac_jax import presets
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files
+from csac_jax.report import result_tables
 from csac_jax.sweeps import runner
 from experiments import index, second_study, second_tables
 
@@ -153,6 +154,56 @@ def test_smoke(tmp_path: Path):
     assert config["parts"].startswith("sampler experiments.samplers.ReaPER(scenes=2")
     report = call("report", "--archives", "archives").stdout
     assert "| replay/reaper-16 | in_distribution |" in report
+
+
+PAGE_ROWS = {  # of docs/study.md: pair of arms, suite, part
+    "`enclosed`": ("enclosed", "enclosed", None),
+    "`blocked`": ("blocked", "blocked", None),
+    "`tray`": ("blocked", "tray", None),
+    "`target`, ridge": ("enclosed", "target", "ridge"),
+    "`target`, row": ("enclosed", "target", "row"),
+    "`target`, random10": ("enclosed", "target", "random10"),
+    "`random10`, cleared": ("blocked", "random10", None),
+}
+
+
+def _archived(arm: str, suite: str, part: str | None) -> float:
+    """Returns an arm's completion, per cent, from the records alone."""
+    contents = index.contents(index.STUDY / "second-pushes.tar.xz")
+    names = [name for name in contents if re.fullmatch(rf"{arm}/.*/eval-{suite}\.json", name)]
+    tables = [json.loads(contents[name]) for name in names]
+    found = [(one["parts"][part] if part else one)["completion"]["value"] for one in tables]
+    assert len(found) == 5
+    return 100.0 * float(stats.trim_mean(found, 0.25))
+
+
+def test_page_says_what_was_measured():
+    """Claim: completions, differences and verdicts of docs/study.md are those of the archive;
+    README has those of two rows."""
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    page = (ROOT / "docs" / "study.md").read_text().split("## Does a push help?")[1]
+    lines = [line for line in page.split("\n## ")[0].splitlines() if line.startswith("| `")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    named = second_tables.hypotheses()
+    judged = [*named["H1"], *named["H2"]]
+    found = {k: v for name in ("H1", "H2") for k, v in _judged(named[name]).items()}
+    assert [name for name, *_ in cells] == list(PAGE_ROWS)
+    for (name, ours, theirs, gap, verdict), row in zip(cells, judged, strict=True):
+        where, suite, part = PAGE_ROWS[name]
+        wanted = [_archived(f"{where}-{kind}", suite, part) for kind in ("pushes", "none")]
+        assert [ours, theirs] == [f"{value:.1f} %" for value in wanted]
+        assert gap.startswith(f"{wanted[0] - wanted[1]:+.1f} (")
+        assert (gap, verdict) == (_shown(found[row.name]), found[row.name].verdict)
+        if name in ("`enclosed`", "`blocked`"):
+            assert re.search(rf"of {name} {wanted[0]:.0f}\D+{wanted[1]:.0f} %", readme)
+
+
+def _judged(rows: list[second_tables.Row]) -> dict[str, second_tables.Difference]:
+    return second_tables.judge(index.STUDY, rows)
+
+
+def _shown(found: second_tables.Difference) -> str:
+    return result_tables.shown(found.band, "+", "completion")
 
 
 def _draw(place: str, suite: str, part: str, count: int) -> dict[str, np.ndarray]:
