@@ -47,7 +47,7 @@ test-slow: $(STAMP)  ## slow tests
 test-faults: $(STAMP)  ## inject every fault (10 minutes); ARGS=NAME for those of that name, SEED=N for others
 	$(BIN)/python -m tests.faults $(if $(SEED),--seed $(SEED)) $(ARGS)
 
-lives: $(STAMP)  ## live whole lives of runs and sweeps for SECONDS (60); SEED=N for others
+lives: $(STAMP)  ## live whole lives of runs, sweeps and policies for SECONDS (60); SEED=N for others
 	$(BIN)/python -m tests.faults.lives --seconds $(or $(SECONDS),60) --jobs $(JOBS) $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 lint: $(STAMP)  ## ruff and mypy

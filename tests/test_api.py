@@ -18,7 +18,7 @@ from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import monitor
+from csac_jax.evaluation import monitor, policies, suites
 from csac_jax.io import checkpoint, configs, files, policy_file
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
@@ -41,6 +41,28 @@ def test_public_names_exist():
         assert getattr(csac_jax, name).__doc__, name
     assert set(csac_jax.__all__) < set(dir(csac_jax))
     assert not hasattr(csac_jax, "make_robot")
+
+
+def test_public_objects_have_short_texts():
+    """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
+    cfg, key = SMOKE, jax.random.key(0)
+    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped_clutter")
+    state = jax.jit(env.reset)(key)
+    arms = [kind(cfg) for kind in policies.BASELINES.values()]
+    objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned, *arms]
+    objects += [
+        csac_jax.deploy.CameraPolicy.load("shipped_clutter"),
+        policies.PlannerPolicy(cfg, learned),
+    ]
+    objects += [learned.debug(state, key), suites.prepare(cfg, "in_distribution", 2)]
+    objects += [api.Run(Path("run"), cfg, SUMMARY, {})]
+    texts = list(map(repr, objects))
+    assert [text for text in texts if len(text) > 400 or "\n" in text] == []
+    params = jax.tree.leaves(learned.params)
+    numbers = sum(leaf.size for leaf in params)
+    named = f"cfg=<fast, csac_beta, seed 1>, params=<{len(params)} arrays, {numbers:,} numbers>"
+    assert repr(learned) == f"NetworkPolicy({named})"
+    assert "reward=0.0, terminated=False" in repr(state)
 
 
 def test_import_leaves_jax_alone():
@@ -241,9 +263,12 @@ def test_run_starts_from_another(trained, tmp_path: Path):
     run, _ = trained
     cfg, stop = SMOKE.change(seed=1), Stop()
     stop.signal = 15  # before the first chunk: a run saves its first state
-    begun = api.train(cfg, tmp_path / "begun", init=run.run_dir, stop=stop, verbose=False)
+    plain, begun = (
+        api.train(cfg, tmp_path / name, init=init, stop=stop, verbose=False)
+        for name, init in (("plain", None), ("begun", run.run_dir))
+    )
     assert (begun.summary.step, begun.summary.stopped_by) == (0, 15)
-    fresh, state, last = programs.init(programs.make(cfg)), _saved(begun), _saved(run)
+    fresh, state, last = map(_saved, (plain, begun, run))
     _assert_starts_from(state.learner, last.learner.online, fresh.learner)
     _assert_same(begun.policy.params, run.policy.params)
     _assert_same(state.scenes, fresh.scenes)

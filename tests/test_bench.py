@@ -7,9 +7,21 @@ import sys
 
 import pytest
 
-from csac_jax.errors import FailedError
+from csac_jax.errors import FailedError, SettingsError
 from experiments import index
-from experiments.bench import __main__ as page, serve
+from experiments.bench import __main__ as page, serve, step_kernels
+
+
+def test_time_in_which_kernels_run():
+    """Claim: the step lasts from the first kernel's start to the last one's end; names tell what a
+    kernel does; a trace without a GPU is refused."""
+    matrix, sums = "sm80_xmma_fprop_implicit_gemm_bf16", "input_reduce_select_fusion_4"
+    table = step_kernels.table([(matrix, 1.0, 3.0), (sums, 4.0, 5.0), (matrix, 8.0, 11.0)])
+    assert (table["step_ms"], table["busy"]) == (10.0, 0.6)
+    assert table["kinds"]["products"] == {"ms": 5.0, "launches": 2}
+    assert table["kinds"]["reductions"] == {"ms": 1.0, "launches": 1}
+    with pytest.raises(SettingsError, match="no GPU ran a kernel"):
+        step_kernels.table([])
 
 
 def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
@@ -23,6 +35,16 @@ def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
     )
     with pytest.raises(FailedError, match=r"did not start \(exit code 2\): no such extra$"):
         serve.measure(1, 9)
+
+
+def test_page_shows_figures_and_failures():
+    """Claim: the page of `make bench` has the main figures of a result, or why there is none."""
+    rates = [{"actions_per_second": rate} for rate in (1.25, 3.0)]
+    shown = [row["value"] for row in page.rows("sweep", {"rows": rates, "wall_seconds": 2})]
+    assert shown == ["1.25", "3", "2"]
+    (row,) = page.rows("sweep", {"failed": "no room", "wall_seconds": 2})
+    assert row == {"benchmark": "sweep", "figure": "failed", "value": "no room"}
+    assert page.FIGURES.keys() == page.MAIN.keys()
 
 
 def test_page_reads_what_benchmarks_write():

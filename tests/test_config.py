@@ -6,9 +6,11 @@ import re
 
 import jax
 import pytest
+from tyro import _docstrings
 
-from csac_jax import presets, section
+from csac_jax import algorithms, presets, section
 from csac_jax.config import Config, PrioritisedReplay
+from csac_jax.io import configs
 
 
 def _config(settings: dict) -> Config:
@@ -37,24 +39,44 @@ def test_number_that_is_not_finite_is_refused(name: str, value: float):
     [
         ("scene.slots", [("box", "ball", "box", "box", "box"), ("box",) * 65]),
         ("scene.min_blocks", [0, 6]),
+        ("scene.packed_fraction", [-0.1, 1.1]),
+        ("scene.certified_fraction", [0.0, 1.1]),
         ("scene.size_jitter", [(-0.1, 0.0), (0.3, 0.0), (0.0, 0.3)]),
         ("scene.density", [(50.0, 900.0), (900.0, 450.0), (450.0, 4000.0)]),
+        ("scene.friction", [(0.05, 1.0), (1.0, 0.5), (0.5, 2.5)]),
         ("scene.drop_extent", [(0.04, 0.2), (0.2, 0.1), (0.2, 0.5)]),
         *(("cem.elites", [65, 1]), ("cem.start", ["somewhere"])),
+        *(("policy.place", ["best"]), ("policy.primitive", ["push"])),
+        *(("target.value", ["mean"]), ("reward.push_label", ["depth"])),
+        *(("reward.lost_block_penalty", [-1.0]), ("learn.loss", ["mse"])),
+        *(("learn.critics", [0, 3]), ("task.kind", ["stack"])),
+        ("sim.physics", ["bullet"]),
         ("sim.grasp_phases", [(0, 110, 80)]),
         ("camera.focal", [(7000.0, 7000.0)]),
         ("sensor.depth_noise", [(-0.1, 0.0), (0.2, 0.0), (0.0, 0.2)]),
+        ("sensor.pose_noise", [(-0.1, 0.0), (0.0, 0.3)]),
+        ("sensor.grey", [-0.1, 1.1]),
         ("heightmap.size", [8, 20]),
+        ("heightmap.extent", [0.05, 1.1]),
         ("net.rotations", [2, 5]),
         ("net.dilations", [(), (1, 0)]),
         ("net.stride", [3]),
+        ("net.subpixel", [3]),
         ("policy.retry_temperature", [-0.1, 11.0]),
+        ("policy.height_bonus", [-0.1, 101.0]),
         ("target.gamma", [-0.1, 1.0]),
         ("reward.grasp_levels", [(-0.4, -0.5, -0.25, 0.0, 1.0), (-1.0, -0.5, -0.25, 0.0, -0.1)]),
         ("explore.epsilon_primitive", [(-0.1, 0.1), (0.5, 1.1)]),
+        ("explore.push_fraction", [-0.1]),
+        ("explore.epsilon_decay", [0.0, 1.1]),
+        ("explore.noise_std", [-0.1]),
         ("learn.learning_rate", [0.0]),
+        ("learn.lr_final_fraction", [0.0, 1.1]),
         ("learn.augment_shift", [-1, 65]),
+        ("learn.tau", [0.0, 1.1]),
         ("replay.capacity", [0, 1, 2**30 + 1, float("nan")]),
+        ("replay.start", [(0.0, 1.0)]),
+        ("replay.sampler", ["best"]),
         ("net.kind", ["resnet"]),
         ("seed", [-1, 2**31]),
     ],
@@ -73,17 +95,24 @@ def test_values_out_of_range(name: str, values: list):
     ("settings", "message"),
     [
         ({"train.learning_starts": 31}, "learn.batch: 32 transitions cannot be drawn"),
+        ({"replay.capacity": 31}, "replay.capacity: must hold"),
         ({"replay.capacity": 40, "train.scenes": 48}, "replay.capacity: must hold"),
         ({"sim.physics": "warp", "scene.size_jitter": (0.0, 0.1)}, "scene.size_jitter: the second"),
+        ({"scene.slots": ()}, "scene.slots: at least one"),
+        ({"camera.size": (8192, 480)}, "camera.size: must be at most 4096"),
         ({"sensor.pose_noise": (0.01, 0.0)}, "sensor.pose_noise: must be 0"),
+        ({"net.subpixel": 4, "net.stride": 2}, "net.subpixel: at most net.stride"),
         ({"heightmap.size": 2**31}, "heightmap.size: must be at most 1024"),
         ({"heightmap.size": 1024, "net.rotations": 32}, "heightmap.size: its square times net"),
+        ({"net.growth": 10**9}, "net.growth: must be at most 1024"),
         ({"learn.actor_batch": 33}, "learn.actor_batch: must not exceed learn.batch"),
         ({"policy.primitive": "grasp"}, "explore.push_fraction: must be 0"),
         (
             {"reward.push_label": "current_critic", "target.bootstrap": "continuing"},
             "reward.push_label: current_critic needs target.bootstrap episodic",
         ),
+        ({"learn.bath": 3}, "learn.bath: unknown setting"),
+        ({"net.norm": "batch"}, "net.norm: unknown setting"),
         ({"bath": 3}, "bath: unknown setting"),
     ],
 )
@@ -149,3 +178,17 @@ def _fields() -> dict[str, tuple[type, dataclasses.Field]]:
 def test_at_most_109_settings():
     """Claim: there are at most 109 settings, those of all alternatives counted."""
     assert len(_fields()) <= 109
+
+
+def test_settings_that_no_preset_turns_say_whom_they_are_for():
+    """Claim: the text of a setting that no preset and no algorithm turns, or of its section, ends
+    with whom it is for; there are at most 20."""
+    turned = {"preset", "algo"}
+    for preset in map(presets.get, presets.PRESETS):
+        for algo in algorithms.ALGORITHMS:
+            turned |= set(configs.differences(Config(), algorithms.configure(preset, algo)))
+    kept = {name: of for name, of in _fields().items() if name not in turned}
+    assert 10 <= len(kept) <= 20
+    for name, (kind, field) in kept.items():
+        text = _docstrings.get_field_docstring(kind, field.name, ()) or ""
+        assert re.search(r"\bfor [\w` ,]+\)", f"{text} {kind.__doc__}"), name

@@ -201,7 +201,6 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
     return len(steps)
 
 
-@pytest.mark.slow
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order."""
     for module in ("jax2onnx", "onnxruntime"):
@@ -371,6 +370,18 @@ def test_contributing_names_files_that_exist():
     named = _named(ROOT / "CONTRIBUTING.md") | _named(EXTEND)
     assert len(named) > 40
     assert not [path for path in named if "NAME" not in path and not (ROOT / path).exists()]
+
+
+def test_every_module_that_tells_primitives_apart_is_named():
+    """Claim: the page on a new primitive names every module that compares pushes and grasps."""
+    sources = (ROOT / "csac_jax").rglob("*.py")
+    compare = re.compile(r"Primitive\.(PUSH|GRASP)")
+    found = [path for path in sources if compare.search(path.read_text())]
+    text = EXTEND.read_text()
+    assert len(found) > 15
+    names = {path.relative_to(ROOT).as_posix() for path in found}
+    names -= {f"csac_jax/baselines/{name}.py" for name in ("antipodal", "oracle")}  # in one row
+    assert not [name for name in names if name not in text]
 
 
 @pytest.mark.parametrize(

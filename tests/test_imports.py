@@ -272,3 +272,22 @@ def test_nothing_is_executed():
     every = {path: dangers(path.read_text()) for path in PACKAGE.rglob("*.py")}
     assert len(every) > 100
     assert not {path: found for path, found in every.items() if found}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "from pickle import loads",
+        "import yaml as y\ny.load(f)",
+        "from yaml import load",
+        "x = exec",
+        "from os import system\nsystem('ls')",
+        "import subprocess\nsubprocess.run('ls', shell=x)",
+        "import numpy as np\nnp.load(f, allow_pickle=True)",
+    ],
+)
+def test_dangers_are_found(source: str):
+    """Claim: the test above can fail."""
+    assert dangers(source)
+    assert not dangers("import yaml\nyaml.safe_load(f)")
+    assert not dangers("import subprocess, re\nsubprocess.run(['ls'], shell=False)\nre.compile('')")

@@ -14,6 +14,7 @@ from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import CEMConfig
 from csac_jax.constants import Primitive
 from csac_jax.robot.primitives import Action
+from csac_jax.runtime import compiler
 
 KEYS = 20
 
@@ -30,6 +31,12 @@ def best(cfg, parts):
     six = parts(cfg)
     run = jax.vmap(lambda key, state: policy.best_action(key, six, state, jnp.int32(0)), (0, None))
     return jax.jit(lambda state: run(jax.random.split(jax.random.key(0), KEYS), state))
+
+
+def _explore(parts, state: DenseMaps, num: int, unchanged: int = 0) -> Action:
+    """Actions to try for `num` keys."""
+    act = lambda key: policy.act(key, parts, state, jnp.int32(unchanged), jnp.int32(0))  # noqa: E731
+    return jax.jit(jax.vmap(act))(jax.random.split(jax.random.key(2), num))
 
 
 def _state(frames, seed: int) -> DenseMaps:
@@ -130,6 +137,13 @@ def test_retries_follow_boltzmann(cfg, frames, parts, failed):
     assert_allclose(share, wanted / wanted.sum(), atol=0.03 if failed else 0.0)
 
 
+def test_grasp_only_never_pushes(cfg, frames, parts):
+    """Claim: grasp_only grasps while it explores too, where pushes are worth more."""
+    own, state = parts(algorithms.configure(cfg, "grasp_only")), _state(frames, 6)
+    state = state.replace(q=state.q.at[Primitive.PUSH].add(5.0))
+    assert np.all(_explore(own, state, 200, unchanged=3).primitive == Primitive.GRASP)
+
+
 def _peaked(key: jax.Array, frames) -> DenseMaps:
     """Draws one to five peaks of grasp values; the actor's logits are noise."""
     key_num, key_centre, key_height, key_width, key_logits = jax.random.split(key, 5)
@@ -169,3 +183,35 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts, start, le
 
     share = np.mean(jax.jit(jax.vmap(reached))(jnp.arange(1000)))
     assert least <= share <= most, share
+
+
+@pytest.mark.slow
+def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
+    """Claim: with the options of training on a CPU, 200 searches end where they do by XLA's own."""
+
+    def search(i: jax.Array) -> jax.Array:
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(5), i))
+        state, both = _peaked(keys[0], frames), cfg.change(cem=CEMConfig(start="both"))
+        return policy.greedy(keys[1], parts(both), state, jnp.int32(0)).values
+
+    own = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+    sooner, by_default = (
+        jax.jit(jax.vmap(search), compiler_options=options)(jnp.arange(200))
+        for options in (compiler.SOONER, {name: own[name] for name in compiler.SOONER})
+    )
+    assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_candidates_are_those_of_the_search(cfg, frames, parts):
+    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
+    key; VPG's only candidate is the best pixel."""
+    one = parts(cfg.change(cem={"rounds": 1, "start": "actor"}))
+    vpg, state, key = parts(algorithms.configure(cfg, "vpg")), _state(frames, 0), jax.random.key(3)
+    for own, num in ((one, cfg.cem.candidates), (vpg, 1)):
+        tried = jax.jit(lambda key, own=own: policy.candidates(key, own, state))(key)
+        assert tried.shape == (2, num, 3)
+        greedy = jax.jit(lambda key, own=own: policy.greedy(key, own, state, jnp.int32(0)).poses)
+        for poses, u in zip(np.asarray(tried), greedy(key), strict=True):
+            pose = np.asarray(maps.denormalise(frames, u))
+            assert np.abs(poses - pose[None]).max(axis=1).min() < 1e-5

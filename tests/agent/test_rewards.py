@@ -85,6 +85,22 @@ def test_new_label_earns_its_reward(was, good):
     assert_allclose(got, [new], rtol=1e-6)
 
 
+def test_rewards_of_a_step_are_those_of_its_actions():
+    """Claim: each action of a step is rewarded by itself; only pushes that gain are good ones."""
+    results = rewards.ActionResult(
+        primitive=jnp.array([Primitive.PUSH, Primitive.PUSH, Primitive.GRASP, Primitive.GRASP]),
+        outcome=jnp.array([0, 0, Outcome.LIFTED, Outcome.NOTHING]),
+        distance=jnp.zeros(4),
+        phi_before=jnp.zeros(4),
+        phi_after=jnp.array([1.0, 0.0, 1.0, 0.0]),
+        changed=jnp.zeros(4, bool),
+        blocks_lost=jnp.zeros(4, jnp.int32),
+    )
+    each, good = rewards.rewards_of(CFG, results)
+    assert_array_equal(each, [0.5, -0.5, 2.0, -1.0])
+    assert_array_equal(good, [True, False, False, False])
+
+
 @pytest.mark.parametrize("primitive", [Primitive.PUSH, Primitive.GRASP])
 def test_blocks_that_left_cost_once(primitive):
     """Claim: an action that loses one block, or three, pays the penalty once."""

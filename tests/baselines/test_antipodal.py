@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from csac_jax.baselines import antipodal
 from csac_jax.baselines.antipodal import Weights
@@ -78,3 +79,23 @@ def test_only_what_is_wanted_is_taken():
     one, two = (_inside(x, 0.0, 0.0, (0.02, 0.05)) for x in (-0.12, 0.12))
     for wanted, side in ((one, -1.0), (two, 1.0)):
         assert side * _grasp(0.05 * (one | two), wanted=wanted).pose[0] > 0.05
+
+
+@pytest.mark.slow
+def test_what_is_out_of_reach_is_left():
+    """Claim: an arm that stands far away takes the bar that it reaches, the hand the narrower."""
+    one, two = _inside(-0.15, 0.0, 0.0, (0.012, 0.05)), _inside(0.15, 0.0, 0.0, (0.03, 0.05))
+    height, wanted = 0.05 * (one | two), one | two
+    assert _grasp(height, wanted=wanted).pose[0] < 0.0
+    far = CFG.change(sim={"robot": "ur5", "base": (0.87, 0.0, 0.35, 0.0)})
+    arm = functools.partial(antipodal.grasp, cfg=far, weights=Weights(), wanted=jnp.asarray(wanted))
+    maps, none = jnp.asarray(height, jnp.float32), jnp.int32(0)
+    assert jax.jit(arm)(jax.random.key(0), height=maps, failures=none).pose[0] > 0.0
+
+
+def test_another_grasp_is_tried_after_a_failure():
+    """Claim: without failures the choice is the same for any key, after some it is not."""
+    height = 0.05 * _inside(0.0, 0.0, 0.5, (0.06, 0.02))
+    first = _grasp(height).pose
+    assert_array_equal(first, _grasp(height).pose)
+    assert not np.array_equal(first, _grasp(height, failures=3).pose)

@@ -5,10 +5,13 @@ import json
 from pathlib import Path
 
 import imageio.v2 as imageio
+import numpy as np
 import pytest
 
 from csac_jax import cli, grippers
-from csac_jax.objects import importing, library
+from csac_jax.cli import objects
+from csac_jax.objects import importing, library, tables
+from csac_jax.render import sheet
 
 Capture = pytest.CaptureFixture[str]
 
@@ -32,6 +35,25 @@ def test_make_and_show(tmp_path: Path, capsys: Capture):
     assert names == ["bottle-0-0", "assembly-0-0", "bowl-0-1", "assembly-0-1"]
 
 
+def test_names_are_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
+    """Claim: `objects show` prints whole names where the table has little room."""
+    monkeypatch.setenv("COLUMNS", "60")
+    member = tables.find("procedural:0:1", "all").objects[0]
+    long = dataclasses.replace(member, name="a_very_long_name_of_a_mesh_file_from_somewhere_else")
+    objects._list([long])
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\u2502")]
+    assert "".join(row.split("\u2502")[1].strip() for row in rows) == long.name
+
+
+def test_sheet_of_one_object_is_small_and_shows_its_name(tmp_path: Path):
+    """Claim: a sheet is as wide as its objects need, and cuts no name at its upper edge."""
+    sheet.write(tmp_path / "one.png", tables.find("procedural:0:1", "all").objects)
+    picture = imageio.imread(tmp_path / "one.png")
+    assert picture.shape[1] < picture.shape[0]
+    ink = np.flatnonzero(picture[: len(picture) // 5].min(axis=(1, 2)) < 100)
+    assert 0 < ink.min() < ink.max() < 0.2 * len(picture) - 1
+
+
 def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
     """Claim: objects that the hand cannot open for are named."""
     narrow = dataclasses.replace(grippers.load("rg2"), opening=(0.0, 0.03))
@@ -43,9 +65,13 @@ def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capt
 
 REFUSED = {
     "": (2, "usage"),
+    "mak": (2, "mak"),
     "make --out x --count 9999": (2, "--count"),
+    "make --out x --seed -1": (2, "--seed"),
     "make --out .": (2, "--out: . exists"),
     "show nowhere": (1, "nowhere: no library"),
+    "show procedural:0:3 --png x.txt": (2, ".png"),
+    "import nowhere --out x": (2, "nowhere does not exist"),
     "import . --out x": (2, "no mesh file"),
     "import . --out x --density 5": (2, "--density"),
 }

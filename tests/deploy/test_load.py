@@ -18,6 +18,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.deploy import image_files as files, record
 from csac_jax.deploy.record import Recorder
+from csac_jax.errors import SettingsError
 from tests.deploy import image_files
 
 pytest.importorskip("uvicorn")
@@ -146,6 +147,26 @@ def test_hostile_bodies_stop_nobody(start: Callable[..., Service], body: bytes):
     assert slowest < 1.0
 
 
+def test_parsing_stops_nobody(
+    start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    """Claim: /health answers while bodies are parsed and while an outcome is written."""
+
+    def slow(*_: Any) -> Any:
+        time.sleep(1.0)
+        raise SettingsError("slow")
+
+    monkeypatch.setattr(requests, "question", slow)
+    monkeypatch.setattr(Recorder, "post", slow)
+    running = start(0.0, tmp_path)
+    outcome = {"id": "000001", "outcome": "lifted"}
+    for path, body in (("/decide", BODY), ("/outcome", outcome)):
+        connection = running.send(path, body)
+        time.sleep(0.2)
+        assert running.ask("/health")[2] < 0.5
+        assert connection.getresponse().status == 400
+
+
 def test_waiting_requests_are_decided_together(
     start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ):
@@ -163,6 +184,16 @@ def test_waiting_requests_are_decided_together(
     decided = sorted(top for batch in running.policy.batches for top in batch)
     assert decided == sorted(body["top"] for body in bodies)
     assert all(set(batch) == {9} for batch in running.policy.batches if 9 in batch)
+
+
+def test_batches_are_small(monkeypatch: pytest.MonkeyPatch):
+    """Claim: the images of a batch of several have no more pixels than one image may have."""
+    monkeypatch.setattr(decider, "batches", lambda: (1, 4, 16))
+    small = requests.question(json.dumps(BODY).encode())
+    large = small._replace(pixels=requests.MOST_PIXELS)
+    assert [decider.batch_size([small] * n) for n in (1, 3, 4, 15, 99)] == [1, 1, 4, 4, 16]
+    assert decider.batch_size([large, small, small, small]) == 1
+    assert decider.batch_size([small, small, small, large]) == 1
 
 
 def test_one_bad_image_spoils_no_batch(
@@ -218,6 +249,19 @@ def test_full_queue_answers_at_once(start: Callable[..., Service], monkeypatch: 
     assert max(seconds for *_, seconds in refused) < 1.0
     assert "too many requests wait" in refused[0][1]["detail"]
     assert max(health) < 1.0
+
+
+def test_queue_is_as_long_as_it_is_soon_answered(
+    start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
+):
+    """Claim: no more requests wait than are answered within LONGEST_WAIT, by the pace so far."""
+    monkeypatch.setattr(batching, "LONGEST_WAIT", 0.2)
+    running = start(0.3)
+    assert running.ask("/decide", BODY)[0] == 200
+    with concurrent.futures.ThreadPoolExecutor(40) as pool:
+        replies = list(pool.map(lambda _: running.ask("/decide", BODY)[0], range(40)))
+    assert replies.count(429) > 20
+    assert replies.count(200) > decider.THREADS
 
 
 def test_nobody_waits_nothing_is_decided(start: Callable[..., Service], tmp_path: Path):

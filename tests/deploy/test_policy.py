@@ -11,7 +11,7 @@ from csac_jax import grippers, presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import CameraConfig
 from csac_jax.deploy import CameraPolicy, Decision, decision as decisions_of
-from csac_jax.errors import DataWarning, SettingsError
+from csac_jax.errors import DataWarning, SettingsError, ViewError
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.vision import camera, observe, raycast
@@ -186,9 +186,26 @@ def test_policy_of_the_target_task_needs_a_mask():
     assert policy.decide(*IMAGE, target_mask=np.asarray(IMAGE.depth > 0))
 
 
+def test_misfit_is_refused(policy: CameraPolicy):
+    """Claim: the checks come before a decision; a number of decisions out of range is refused."""
+    with pytest.raises(ViewError, match="millimetres"):
+        policy.decide(IMAGE.rgb, 1000 * IMAGE.depth, *IMAGE[2:])
+    for top in (0, 65):
+        with pytest.raises(SettingsError, match=r"top: must lie in 1 \.\. 64"):
+            policy.decide(*IMAGE, top=top)
+
+
 def test_robot_may_have_another_gripper(decisions: list[Decision]):
     """Claim: a policy decides for the gripper that it is given, by default for its own."""
     other = CameraPolicy.load("shipped_clutter", gripper="2f85").decide(*IMAGE)[0]
     assert (decisions[0].width, other.width) == pytest.approx((0.11, 0.085))
     with pytest.raises(SettingsError, match="neither one of"):
         CameraPolicy.load("shipped_clutter", gripper="2f86")
+
+
+def test_net_of_heights_sees_no_colours():
+    """Claim: a policy with `net.colour` off decides the same whatever the colours are."""
+    heights = _untrained(net={"colour": False})
+    other = IMAGE._replace(rgb=np.roll(255 - IMAGE.rgb, 7, axis=1))
+    first, second = (heights.decide(*image)[0].to_dict() for image in (IMAGE, other))
+    assert first == second

@@ -5,6 +5,8 @@ import concurrent.futures
 import contextlib
 import http.client
 import json
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +27,7 @@ from csac_jax.deploy import decider, server, service  # isort: skip
 
 TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
-CLIENTS = 16
+CLIENTS = 50
 
 
 def _base64(content: bytes) -> str:
@@ -119,7 +121,9 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
     ("body", "status", "detail"),
     [
         ({"id": "../../etc", "outcome": "lifted"}, 404, "there is no decision ../../etc"),
+        ({"id": "1" * 256, "outcome": "lifted"}, 404, "there is no decision 1111"),
         ({"id": "000001", "outcome": "good"}, 422, "'outcome' should be 'nothing'"),
+        ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "'number' should be"),
         ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
     ],
 )
@@ -186,13 +190,19 @@ def test_token_is_asked_for(server: Server, path: str, token: str):
     ("body", "status", "detail"),
     [
         (b"", 422, "Invalid JSON"),
+        (b"{", 422, "Invalid JSON"),
+        (b"\xff\xfe\x00", 422, ""),
         ({}, 422, "'rgb' is missing"),
         ({**BODY, "speed": 1}, 422, "'speed' is unknown"),
+        ({**BODY, "top": 1000}, 400, "top: must lie in 1 .. 64, not 1000"),
         ({**BODY, "rgb": "%%%"}, 400, "rgb: must be a PNG in base64"),
+        ({**BODY, "rgb": _base64(b"GIF89a" * 9)}, 400, "rgb: must be a PNG"),
         ({**BODY, "rgb": _base64(HUGE)}, 400, "rgb: has 9000 x 9000 px; at most 4,194,304"),
         ({**BODY, "rgb": _base64(PNG[:3000])}, 400, "the image is damaged"),
         ({**BODY, "rgb": _base64(TWICE)}, 400, "rgb: has 4000 x 4000 px; at most 4,194,304"),
         ({**BODY, "depth": BODY["rgb"]}, 400, "depth: is uint8; give a PNG of 16 bits"),
+        ({**BODY, "intrinsics": {"fx": 1}}, 400, "intrinsics: 'width' is missing"),
+        ({**BODY, "pose": {"matrix": [[1.0]]}}, 400, "camera_pose: must be a 4 x 4 matrix"),
         ({**BODY, "pose": {"matrix": np.eye(4).tolist()}}, 422, "camera_pose: the workspace's cen"),
         (b'{"rgb": ' + b"[" * 100_000, 400, "the body has more than 1000 keys and values"),
         (b" " * (16 * 2**20 + 1), 413, "the body is larger than 16384 KiB"),
@@ -207,6 +217,20 @@ def test_bad_requests_are_refused(server: Server, body: Any, status: int, detail
     assert detail in answer["detail"]
     assert len(answer["detail"]) < 400
     assert server.ask("GET", "/health") == (200, {"status": "ok"})
+
+
+@pytest.mark.slow
+def test_answers_are_those_of_the_schema(server: Server, tmp_path: Path):
+    """Claim: of the requests that schemathesis makes of the schema, good and bad ones, all get an
+    answer that the schema has. That bytes are a whole PNG no schema can say."""
+    pytest.importorskip("schemathesis")
+    run = "from schemathesis.cli import schemathesis; schemathesis()"
+    options = ["-H", f"Authorization: Bearer {TOKEN}", "--checks", "all", "--seed", "0"]
+    options += ["--exclude-checks", "positive_data_acceptance"]
+    where = f"http://127.0.0.1:{server.port}/openapi.json"
+    command = [sys.executable, "-c", run, "run", where, *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("token", [TOKEN, "wrong"])
@@ -228,7 +252,7 @@ def test_body_without_a_length_is_limited(server: Server, token: str):
 
 
 def test_many_clients_lose_nothing(server: Server):
-    """Claim: 16 clients at once, each with its own `top`, all get their own answer."""
+    """Claim: 50 clients at once, each with its own `top`, all get their own answer."""
     tops = [1 + number % 3 for number in range(CLIENTS)]
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
         asked = [pool.submit(server.ask, "POST", "/decide", {**BODY, "top": n}) for n in tops]

@@ -18,6 +18,14 @@ def test_objects_are_counted_by_hand():
     assert metrics.by_object(names, in_play, left) == counts
 
 
+def test_intervals_stay_within_their_bounds():
+    """Claim: an interval of a share lies in 0 .. 1, exactly, and holds its value."""
+    for n in range(1, 400):
+        for lifted in (0, n):
+            share = metrics.wilson(lifted, n)
+            assert 0.0 <= share["low"] <= share["value"] <= share["high"] <= 1.0
+
+
 @pytest.mark.parametrize(
     ("successes", "n"), [(0, 1), (1, 1), (0, 50), (50, 50), (1, 7), (47, 50), (1234, 4321)]
 )
@@ -70,6 +78,13 @@ def test_grasps_of_one_episode_are_alike():
     for lifted, n in ((6, 10), (10, 10), (0, 10)):
         got = metrics.clustered(np.full(50, lifted), np.full(50, n))
         assert got == pytest.approx(metrics.wilson(50 * lifted, 50 * n), abs=1e-12)
+
+
+def test_bootstrap_repeats():
+    """Claim: the interval is the same each time, and another with another seed."""
+    above, below = np.arange(10), np.arange(10) + 5
+    one, again, other = (metrics.bootstrap_ratio(above, below, 10, seed) for seed in (1, 1, 2))
+    assert one == again != other
 
 
 def _episodes() -> Episodes:

@@ -19,7 +19,7 @@ from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.nets import networks
 from csac_jax.objects import tables
 from csac_jax.scenes import cases, certify, constructions, pool
-from csac_jax.vision import observe
+from csac_jax.vision import heightmap, observe
 from csac_jax.world import model, object_slots
 from csac_jax.world.scene_state import SceneState
 from tests.vision import mujoco_rays
@@ -59,8 +59,6 @@ def test_suite_is_built_and_rolls_out(suite: str):
         wanted = {"enclosed": ("target", 5), "hidden": ("target", 10)}.get(suite, ("clear", 15))
         assert env.cfg.task.kind == wanted[0]
         assert env.cfg.task.max_actions == max(wanted[1], 15 if suite == "tray" else 0)
-    if suite in ("blocked", "hidden"):  # as the others, by physics that these have too
-        return
     env = next(iter(parts.values()))
     episodes = rollout.rollout(env, policies.RandomPolicy(env.cfg), 2, seed=0)
     assert episodes.valid[:, 0].all()
@@ -143,6 +141,13 @@ def test_every_policy_searches_for_a_hidden_target():
         after = step(state, action)
         assert np.isfinite(np.asarray(after.reward)), name
         assert not bool(after.info.physics_diverged), name
+
+
+def test_wanted_is_the_mask_or_everything():
+    """Claim: `heightmap.wanted` is the mask where a cell of it is True, else True everywhere."""
+    mask = jnp.zeros((8, 8), bool).at[2, 3].set(True)
+    np.testing.assert_array_equal(heightmap.wanted(mask), mask)
+    assert np.asarray(heightmap.wanted(jnp.zeros((8, 8), bool))).all()
 
 
 def test_tight_objects_hardly_fit(monkeypatch: pytest.MonkeyPatch):

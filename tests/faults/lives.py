@@ -1,4 +1,4 @@
-"""Whole lives of runs and sweeps, drawn at random and judged by a small model.
+"""Whole lives of runs, sweeps and policies, drawn at random and judged by a small model.
 
     python -m tests.faults.lives [--seconds N] [--seed N] [--jobs N] [--life N]
 
@@ -38,12 +38,18 @@ import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
 import jax  # isort: skip
 import numpy as np
+import safetensors.numpy
 
+from csac_jax import presets
+from csac_jax.agent import actor_critic
+from csac_jax.cli import output
 from csac_jax.constants import GRASP_WINDOW
 from csac_jax.errors import DataWarning, FailedError, SettingsError
-from csac_jax.io import checkpoint, files, lock
+from csac_jax.io import checkpoint, configs, files, lock, policy_file, renames
 from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.io.lock import LockedError
+from csac_jax.io.policy_file import PolicyFileError
+from csac_jax.report import results
 from csac_jax.runtime import provenance, signals
 from csac_jax.sweeps import runner
 from csac_jax.sweeps.grid import SweepPoint
@@ -52,6 +58,7 @@ from csac_jax.training import loop
 from tests.faults import harness, toy
 from tests.faults.harness import Tally
 
+CFG = presets.smoke()
 REPORTED = (SettingsError, FailedError, OSError)  # what a command shows as one line
 DRAFTS = re.compile(r"\.tmp$|\.saving|orbax-checkpoint-tmp")
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
@@ -139,6 +146,12 @@ def _states(seeds: Any) -> toy.State:
 @functools.cache
 def _reference(seed: int) -> toy.Reference:
     return toy.Reference(seed)
+
+
+@functools.cache
+def _params(number: int) -> Any:
+    rng, blank = np.random.default_rng(number), actor_critic.abstract_params(CFG)
+    return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
 
 
 class _Reporter(toy.Quiet):
@@ -260,6 +273,28 @@ def _sweep_program(group: Any) -> Any:
     )
 
 
+@dataclasses.dataclass
+class Policy:
+    """A policy file as it must be."""
+
+    path: Path
+    number: int  # of its networks
+    damaged: bool = False
+    digest: bool = True
+
+    def judge(self, tally: Tally, about: str) -> None:
+        try:
+            cfg, params = policy_file.load(self.path)
+        except PolicyFileError as error:
+            tally.check(self.damaged, "lost", f"{about}: {error}")
+            return
+        wrong = self.damaged and self.digest
+        tally.check(not wrong, "silent", f"{about}: damage is unnoticed")
+        same = jax.tree.map(np.array_equal, params, _params(self.number))
+        right = cfg == CFG and all(jax.tree.leaves(same))
+        tally.check(right or self.damaged, "silent", f"{about}: another policy is read")
+
+
 class Life:
     """One life: its folder, what must be in it, and the dice."""
 
@@ -267,6 +302,7 @@ class Life:
         self.folder, self.rng, self.tally = folder, rng, tally
         self.runs: list[Run] = []
         self.sweeps: list[Sweep] = []
+        self.policies: list[Policy] = []
         self.names = (f"{kind}{number}" for number in itertools.count() for kind in ("a", "b c"))
         self.past: list[str] = []
         self.late = 0.0  # s that the clock was put back
@@ -277,8 +313,8 @@ class Life:
     def pick(self, items: list[Any]) -> Any:
         return items[int(self.rng.integers(len(items)))]
 
-    def new(self) -> Path:
-        return self.folder / next(self.names)
+    def new(self, suffix: str = "") -> Path:
+        return self.folder / f"{next(self.names)}{suffix}"
 
     def call(self, work: Callable[[], Any], refused: bool = False, kill: int = 0) -> bool:
         """Carries out the work of a process; returns True if it was killed or refused.
@@ -415,10 +451,10 @@ def put_clock_back(life: Life) -> None:
 
 def move(life: Life) -> None:
     """Renames a folder, or moves it to another one."""
-    things: list[Run | Sweep] = [*life.runs, *life.sweeps]
+    things = [*life.runs, *life.sweeps, *life.policies]
     if things := [one for one in things if one.path.exists()]:
         one = life.pick(things)
-        target = life.new()
+        target = life.new(one.path.suffix)
         if life.rng.random() < 0.5:
             target = target.with_name("moved") / target.name
             target.parent.mkdir(exist_ok=True)
@@ -428,7 +464,7 @@ def move(life: Life) -> None:
 
 
 def upgrade(life: Life) -> None:
-    """Turns the newest checkpoint into one of a former version."""
+    """Turns the newest checkpoint, or a policy, into one of a former version."""
     for run in [run for run in life.runs if run.sound][:1]:
         folder = checkpoint.sound(run.path)
         record = folder / "extra" / "metadata"
@@ -440,6 +476,22 @@ def upgrade(life: Life) -> None:
         files.write_json(folder / checkpoint.MANIFEST, checkpoint._digests(folder))
         (folder.parent / "run").unlink(missing_ok=True)
         run.judge(life.tally, life.about())
+    for policy in [one for one in life.policies if not one.damaged][:1]:
+        tensors = safetensors.numpy.load_file(policy.path)
+        stored = {"config": json.dumps(_former(configs.to_dict(CFG)))}
+        safetensors.numpy.save_file(tensors, policy.path, stored)
+        policy.digest = False
+        policy.judge(life.tally, life.about())
+
+
+def _former(config: dict[str, Any]) -> dict[str, Any]:
+    """Gives settings their former names."""
+    for old, new in renames.SETTINGS.items():
+        section, field = (new or ".").split(".")
+        if field in config.get(section, {}):
+            former, name = old.split(".")
+            config[former][name] = config[section].pop(field)
+    return config
 
 
 def sweep(life: Life) -> None:
@@ -458,6 +510,48 @@ def _run_sweep(life: Life, one: Sweep, chunks: int, kill: int = 0) -> None:
             one.saved[str(path.relative_to(one.path))] = step
 
 
+def export(life: Life) -> None:
+    """Writes a policy into a new file; it may be killed."""
+    policy = Policy(life.new(".safetensors"), int(life.rng.integers(4)))
+    save = functools.partial(policy_file.save, policy.path, _params(policy.number), CFG)
+    killed = life.call(save, kill=6)  # it makes three calls
+    if not killed or policy.path.exists():
+        life.policies.append(policy)
+        policy.judge(life.tally, life.about())
+
+
+def finetune(life: Life) -> None:
+    """Reads a policy and writes another one beside it."""
+    for policy in [one for one in life.policies if not one.damaged][-1:]:
+        tuned = Policy(life.new(".safetensors"), (policy.number + 1) % 4)
+        cfg, _ = policy_file.load(policy.path)
+        params = _params(tuned.number)
+        if not life.call(functools.partial(policy_file.save, tuned.path, params, cfg)):
+            life.policies.append(tuned)
+            tuned.judge(life.tally, life.about())
+        policy.judge(life.tally, life.about())
+
+
+def corrupt_policy(life: Life) -> None:
+    """Damages a policy."""
+    for policy in [one for one in life.policies if not one.damaged][:1]:
+        harness.damage(life.rng, life.pick(list(harness.DAMAGES)), policy.path)
+        policy.damaged = True
+        policy.judge(life.tally, life.about())
+
+
+def evaluate(life: Life) -> None:
+    """Writes an evaluation beside a run's log and reports both."""
+    for run in [run for run in life.runs if run.sound][:1]:
+        path, share = run.path / "eval.json", {"value": 0.5, "low": 0.4, "high": 0.6, "n": 9}
+        table = {"grasp_success": share, "policy": "learned", "suite": "random"}
+        cfg = toy.config(seed=run.seed)
+        life.call(functools.partial(output.write_result, path, table, cfg))
+        found = results.read([run.path])
+        whole = len(found.evaluations) == 1 and (len(found.runs) == 1 or not run.log_whole)
+        life.tally.check(whole, "lost", f"{life.about()}: {found.notes}")
+
+
 STEPS: dict[Callable[[Life], None], float] = {
     train: 3.0,
     kill: 4.0,
@@ -468,6 +562,10 @@ STEPS: dict[Callable[[Life], None], float] = {
     move: 2.0,
     upgrade: 1.0,
     sweep: 1.5,
+    export: 1.0,
+    finetune: 1.0,
+    corrupt_policy: 0.5,
+    evaluate: 1.0,
 }
 """The steps of a life, and how often they come."""
 
@@ -490,6 +588,8 @@ def live(number: int, seed: int = 0) -> Tally:
         for run in life.runs:
             life.train(run, chunks=1)
             run.judge(tally, life.about())
+        for policy in life.policies:
+            policy.judge(tally, life.about())
         tally.remarks = [f"life {number}: {one.replace(name, '')}" for one in tally.remarks]
     return tally
 

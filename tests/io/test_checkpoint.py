@@ -138,6 +138,11 @@ def test_paths_that_orbax_misreads_are_refused(tmp_path: Path, name: str):
         checkpoint.check_path(tmp_path / name)
 
 
+def test_extra_content_comes_back(run_dir: Path):
+    """Claim: what was saved beside the state is read without it."""
+    assert checkpoint.load_extra(run_dir) == {"seconds": 4.0, "grasps": [0, 1]}
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [

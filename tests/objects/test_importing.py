@@ -125,7 +125,8 @@ def test_a_pipe_is_refused(tmp_path: Path):
         importing.files([tmp_path / "a.stl"])
 
 
-def test_workers_end_with_the_import(tmp_path: Path):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_import(tmp_path: Path, number: signal.Signals):
     """Claim: an import that is killed leaves no worker."""
     knot = trimesh.creation.torus(0.05, 0.02, 96, 48)
     paths = [_file(tmp_path, knot, f"{name}.stl") for name in range(4)]
@@ -139,7 +140,7 @@ def test_workers_end_with_the_import(tmp_path: Path):
     )
     _wait_until(lambda: len(_workers(process.pid)) == 2, 60)
     workers = _workers(process.pid)
-    process.send_signal(signal.SIGKILL)
+    process.send_signal(number)
     process.wait(20)
     _wait_until(lambda: not any(Path(f"/proc/{worker}/cmdline").exists() for worker in workers), 20)
 

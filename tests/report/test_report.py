@@ -28,6 +28,8 @@ from csac_jax.report.comparison import ResultReport
 
 CASES = ("hole", "row")
 PUSHES = Path(__file__).parents[2] / "experiments" / "results" / "bench" / "push_suites.json"
+MANY = {"net__head": 16, "learn__batch": 4, "learn__tau": 0.5, "cem__start": "actor"}
+MANY |= {"learn__updates_per_step": 9, "target__gamma": 0.1, "train__actions": 90}
 
 
 def _config(algo: str, seed: int, **changed: Any) -> dict[str, Any]:
@@ -124,6 +126,18 @@ def test_one_policy_measured_twice_is_not_two_runs(recorded: Path):
     assert values == {10: [0.5] * 2, 40: [0.9] * 2}
 
 
+def test_command_loads_the_modules(tmp_path: Path):
+    """Claim: a recorded command loads the modules of one's own that the run or evaluation had."""
+    own = {"modules": {"mine": "0123456789ab"}}
+    _run(tmp_path / "a", _config("vpg", 0), [0.5], own)
+    _evaluation(tmp_path / "a" / "eval.json", _config("vpg", 0), 5)
+    content = json.loads((tmp_path / "a" / "eval.json").read_text()) | own
+    (tmp_path / "a" / "eval.json").write_text(json.dumps(content))
+    rows = result_tables.provenance(_report(tmp_path))
+    assert len(rows) == 2
+    assert all(row["settings as a command"].endswith(" --import mine") for row in rows)
+
+
 def test_own_parts_are_other_variants(tmp_path: Path):
     """Claim: runs and evaluations with parts of one's own are named by them and not pooled with
     others of the same config; with a learner of one's own no algorithm is named. Their command says
@@ -174,6 +188,21 @@ def test_numbers_as_json(recorded: Path):
     assert (swept["device"], swept["wall time"]) == ("two cards", "99 s, whole sweep")
     command = "csac-jax train paper --algo csac_beta --seed 0 --sim.physics c"
     assert first["settings as a command"] == command
+
+
+def test_variants_of_many_changes_are_named_by_their_folder(tmp_path: Path):
+    """Claim: a variant with more than six changes has the name of its folder, its evaluation also
+    that of its file; settings that no result depends on name no variant."""
+    config = _config("csac_beta", 0, **MANY)
+    _run(tmp_path / "wide" / "seed-0", config, [0.5])
+    _evaluation(tmp_path / "wide" / "seed-0" / "eval-2f85.json", config, 5)
+    report = _report(tmp_path)
+    names = {row["policy"] for row in result_tables.evaluation(report)}
+    assert names == {f"CSAC-beta ({config['preset']}), wide, eval-2f85"}
+    few = comparison.label(report.curves[0].variant, preset=False, most=3)
+    assert (few.count(", "), few[-12:]) == (4, ", others (4)")
+    same = _config("vpg", 0, train__chunk=7, train__save_every=3)
+    assert variants.variant(same).changed == ()
 
 
 def test_evaluation_ends_with_the_mean_of_the_parts(recorded: Path):
@@ -265,6 +294,45 @@ def test_rates_of_training_stand_side_by_side(tmp_path: Path):
     assert cells == [["0.500", "50.0 %", "7.50", "3.00"], ["-"] * 4]
 
 
+def test_older_evaluations_give_actions_and_pushes_by_their_counts(tmp_path: Path):
+    """Claim: an evaluation without metrics per episode gets them from its counts, without an
+    interval; one that has them keeps its own."""
+    path = tmp_path / "eval.json"
+    _evaluation(path, _config("vpg", 0), 5)
+    content = json.loads(path.read_text())
+    for part in content["parts"].values():
+        part["counts"] |= {"pushes": 30, "grasps": 20}
+        del part["pushes_per_episode"]
+    path.write_text(json.dumps(content))
+    row = result_tables.evaluation(_report(path))[0]
+    assert row["pushes / episode"] == "3.00"
+    assert row["actions / episode"].startswith("0.50 (")  # what `_evaluation` wrote
+
+
+def test_old_names_are_read_as_todays(tmp_path: Path):
+    """Claim: logs, evaluations and configs with former names say what they would say now, a config
+    of a network that is gone, too."""
+    old = _config("csac_beta", 0) | {"net": {"kind": "offset"}}
+    old["scene"]["arranged"] = 0.5
+    del old["scene"]["packed_fraction"]
+    _run(tmp_path / "run", old, [0.5])
+    (run,) = results.read([tmp_path / "run"]).runs
+    assert dict(run.variant.changed).items() >= {"scene.packed_fraction": "0.5"}.items()
+    line = {"step": 1, "actions": 8, "grasps_counted": 0, "seconds": 1.0}
+    log = tmp_path / "run" / "metrics.jsonl"
+    log.write_text(json.dumps({**line, "ill": 1, "left": 2, "saturated": 3}) + "\n")
+    new = {"physics_diverged": 1, "blocks_lost": 2, "contact_overflow": 3}
+    assert files.read_log(log) == [{**line, **new}]
+    share = metrics.wilson(1, 10)
+    part = {"completion": share, "counts": {"left": 2}}
+    content = {"policy": "learned", "suite": "own", "parts": {"own": part}, "config": old}
+    (tmp_path / "eval.json").write_text(json.dumps(content))
+    (one,) = results.read([tmp_path / "eval.json"]).evaluations
+    assert (one.suite, one.part) == ("in_distribution", "in_distribution")
+    assert one.metrics["counts"] == {"blocks_lost": 2}
+    assert one.config["scene"]["packed_fraction"] == 0.5
+
+
 def test_robots_of_training_are_told_apart(tmp_path: Path):
     """Claim: runs with another robot are another variant; an evaluation with another robot stays
     of its run's variant."""
@@ -302,6 +370,8 @@ TWO, OTHER = (OBJECTS | {"scene__objects": f"procedural:{seed}:9"} for seed in (
         ({}, {"sim__gripper": "2f85"}, "--sim.gripper 2f85"),
         ({}, {"policy__augment": True}, "--augment on"),
         ({"policy__augment": True}, {}, "--augment off"),
+        ({}, {"policy__height_bonus": 3.0}, "--height-bonus 3.0"),
+        ({"policy__retry_temperature": 0.1}, {}, "--retry-temperature 0.0"),
         (OTHER, TWO, "--objects procedural:2:9 --split all"),
         ({"heightmap__view": "oblique", "sensor__kind": "d415"}, SEEN, None),
         (SEEN, SEEN, ""),
@@ -359,6 +429,39 @@ def test_results_of_others_are_one_table(tmp_path: Path, capsys: pytest.CaptureF
     assert f"{mine}/blocked.json: was changed after it was measured" in line
 
 
+def test_what_looks_alike_says_how_it_differs(tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: rows of one suite that were measured by another record, hand or setting say so, and
+    what each record is about; a baseline in another world is no second run of it. Where nothing
+    differs there is no such column."""
+    share = metrics.wilson(8, 10)
+    row = {"suite": "pile", "policy": "a", "episodes": 10, "seed": 0, "completion": share}
+    record = {
+        "weak": {"about": "of 20 N", "results": [{"opening": "full", **row}]},
+        "strong": {"about": "of 100 N", "results": [{"opening": "fit", **row}, row | {"seed": 1}]},
+    }
+    files.write_json(tmp_path / "record.json", record)
+    for opening in ("full", "fit"):
+        config = _config("csac_beta", 0, sim__opening=opening)
+        content = {"policy": "random", "suite": "blocked", "seed": 0, "episodes": 10}
+        content |= dict.fromkeys(results.METRICS, share) | {"config": config}
+        files.write_json(tmp_path / f"{opening}.json", seal.seal(content))
+
+    def told(*names: str) -> str:
+        assert cli.main(["report", *(str(tmp_path / name) for name in names)]) == 0
+        return capsys.readouterr().out
+
+    shown = told(".")
+    column = [line.split("|")[10].strip() for line in shown.splitlines() if "| pile | a" in line]
+    assert column == ["record weak, opening full", "record strong, opening fit", "record strong"]
+    assert "- record strong: of 100 N" in shown
+    assert [shown.count(f"| sim.opening {opening} |") for opening in ("full", "fit")] == [1, 1]
+    evaluated = [line.split("|") for line in shown.splitlines() if line.startswith("| random")]
+    assert len(evaluated) == 2
+    assert {cells[3].strip() for cells in evaluated} == {"c, hand, 0"}
+    assert {cells[4].strip() for cells in evaluated} == {"1"}
+    assert "differs in" not in told("fit.json")
+
+
 def test_digest_covers_the_content(tmp_path: Path):
     """Claim: the digest is SHA-256 of the rest as JSON with sorted keys and no spaces, whatever the
     order and the indentation of the file; content without one passes."""
@@ -369,6 +472,27 @@ def test_digest_covers_the_content(tmp_path: Path):
     assert not seal.is_intact({**sealed, "b": [1, 0.2]})
     assert not seal.is_intact({**sealed, "c": 0})
     assert seal.is_intact({"b": 1})
+
+
+def test_missing_things_are_noted(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    """Claim: an empty folder, runs of different lengths, one of a kind, one not evaluated: one line
+    each."""
+    for name in ("empty", "bare"):
+        (tmp_path / name).mkdir()
+    line = {"step": 1, "actions": 8, "grasps_counted": 1, "seconds": 1.0, "grasp_success": 1.0}
+    (tmp_path / "bare" / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+    assert cli.main(["report", str(recorded), str(tmp_path / "empty"), str(tmp_path / "bare")]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
+    wanted = (
+        "empty: holds no metrics.jsonl",
+        "bare/metrics.jsonl: no readable config",
+        "bare: holds no metrics.jsonl",
+        "max: not evaluated; run: csac-jax eval",
+        "CSAC-beta (paper): runs end at 300, 400 actions",
+        "VPG (paper): one run only",
+        "CSAC-beta (paper), target.value max: one run only",
+    )
+    assert [sum(text in note for note in notes) for text in wanted] == [1] * len(notes)
 
 
 @pytest.mark.parametrize(
@@ -431,6 +555,17 @@ def test_figures(recorded: Path):
     panels = figures.training([found[0]] * 7 + found[1:]).axes
     colours = [[line.get_color() for line in panel.get_lines()] for panel in panels]
     assert (list(map(len, colours)), len(set(colours[1]))) == ([6, 3], 3)
+
+
+def test_methods_of_a_figure_have_colours_of_their_own():
+    """Claim: as many methods as a figure has are of different colours, an algorithm's first variant
+    of the same one everywhere."""
+    own = ["own learner", "mine", "another", "random", "geometric", "oracle"]
+    for methods in ([*variants.NAMES, *own], ["csac_beta"] * 12, [*own, "vpg", "vpg"]):
+        colours = figures._colours(methods)
+        assert len(set(colours)) == len(colours)
+        for algo in set(methods) & set(variants.NAMES):
+            assert colours[methods.index(algo)] == figures.COLOURS[algo]
 
 
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -507,6 +642,8 @@ def test_damaged_lines_are_counted(recorded: Path, capsys: pytest.CaptureFixture
         ("eval.json", "[" * 100_000),
         ("eval.json", '{"policy": "learned", "config": {}, "parts": {"a": {"completion": 3}}}'),
         ("train.json", '{"versions": 3}'),
+        ("train.json", '{"config": []}'),
+        ("config.json", '{"preset": ["paper"]}'),
         ("config.json", '{"sim": 0.5}'),
     ],
 )

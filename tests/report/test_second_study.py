@@ -16,7 +16,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from csac_jax import presets
+from csac_jax import algorithms, presets
+from csac_jax.cli import failures
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files
 from csac_jax.report import result_tables
@@ -62,6 +63,41 @@ def test_arms_are_those_of_the_protocol():
     numbers = {arm.part: arm.seeds[1] for arm in second_study.arms()}
     assert numbers == {row[0]: int(row[4]) for row in _table("Arms")}
     assert len({arm.place for arm in second_study.arms()}) == len(second_study.arms())
+
+
+def test_arms_can_begin(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    """Claim: the sweep's parser reads each arm. Two arms that a hypothesis compares differ in what
+    it is about alone; the paper's rule is a setting of CSAC."""
+    monkeypatch.setattr(failures, "check_physics", lambda *_: None)  # no GPU is needed to plan
+    plain = [arm for arm in second_study.arms() if arm.part != "methods"]
+    cfgs = {arm.place: second_study.plan_of(arm, tmp_path).points[0].cfg for arm in plain}
+
+    def changed(ours: str, theirs: str) -> set[str]:
+        first, second = (configs.flat(configs.to_dict(cfgs[name])) for name in (ours, theirs))
+        names = {name for name in first | second if first.get(name) != second.get(name)}
+        return names - {"seed", "algo"}
+
+    grasps = {"policy.primitive", "explore.push_fraction"}
+    assert changed("pushes/enclosed-pushes", "pushes/enclosed-none") == grasps
+    assert changed("pushes/blocked-pushes", "pushes/blocked-none") == grasps
+    assert changed("control/uniform-16", "replay/uniform-16") == set()
+    assert changed("replay/uniform-2", "replay/uniform-16") == {"learn.updates_per_step"}
+    assert changed("replay/reaper-16", "replay/uniform-16") == {"parts"}
+    assert changed("replay/geometric-2", "replay/uniform-2") == {"parts"}
+    sampler = {"replay.sampler", "replay.rank_by", "replay.start", "replay.middle", "replay.end"}
+    assert "replay.sampler" in changed("replay/beta-16", "replay/uniform-16") <= sampler
+    assert changed("contact/100N-none", "contact/20N-none") == {"sim.down_force"}
+    assert changed("contact/20N-none", "replay/uniform-16") == grasps
+    assert changed("guarded/pushes", "replay/uniform-16") == {"sim.approach"}
+    assert changed("search/csac_rule", "search/csac") == {"policy.primitive"}
+    volume = [c.learn.batch * c.learn.updates_per_step / c.train.scenes for c in cfgs.values()]
+    assert {"replay/uniform-2": 2.0, "replay/uniform-16": 16.0}.items() <= dict(
+        zip(cfgs, volume, strict=True)
+    ).items()
+    assert {arm.name for arm in plain if arm.part == "search"} == {
+        *(algorithms.ALGORITHMS.keys() & {arm.name for arm in plain}),
+        "csac_rule",
+    }
 
 
 def test_search_chooses_by_completion(tmp_path: Path):
@@ -280,6 +316,53 @@ def test_verdicts(recorded: Callable[..., Path]):
     assert second_tables.judge(archives, crowd)["enclosed"].verdict == "open"
     assert second_tables.judge(archives, rows["H5"])["target"].verdict == "equal"
     assert second_tables.judge(archives, rows["H2"]) == {}
+
+
+def test_a_control_that_differs_voids(recorded: Callable[..., Path]):
+    """Claim: where uniform replay differs from its control, the report says that no row of samplers
+    leads or lags."""
+    column = np.linspace(0.1, 0.3, 8)
+    given = {
+        (f"replay/{name}-16", "enclosed", "enclosed"): _completion(column + gain)
+        for name, gain in (("uniform", 0.0), ("reaper", 0.4))
+    }
+    for control, is_void in ((0.0, False), (0.5, True)):
+        place = ("control/uniform-16", "enclosed", "enclosed")
+        archives = recorded({**given, place: _completion(column + control)})
+        second_tables.read.cache_clear()
+        report = second_tables.report(archives, [])
+        assert "| reaper, volume 16 | +40.0" in report
+        assert ("**H3** (completion, points; the control differs" in report) == is_void
+
+
+def test_claims_by_hand(recorded: Callable[..., Path], tmp_path: Path):
+    """Claim: a method's row has completion and lifts per grasp over the parts of `target`, success
+    over the last grasps of training, its area over the first 500 actions, and seconds."""
+    lifts = {name: np.array([0.2, 0.6]) for name in (*METRICS, "action_efficiency_grasps")}
+    parts = {("methods/vpg", "target", part): lifts for part in ("hole", "row")}
+    archives = recorded(parts)
+    config = configs.to_dict(algorithms.configure(presets.get("paper_small"), "vpg"))
+    contents = {"config.json": json.dumps(config)}
+    for seed, final in ((1000, 0.8), (1001, 0.6)):
+        folder = tmp_path / "runs" / "methods" / "vpg" / "base" / f"seed-{seed}"
+        rows = [(250, 0.2), (500, 0.4), (2500, final)]  # 0.2 before, and linear in between
+        keys = ("actions", "grasp_success", "grasps_counted", "seconds", "step")
+        lines = [dict(zip(keys, (n, share, 200, n / 10, n), strict=True)) for n, share in rows]
+        contents["metrics.jsonl"] = "\n".join(map(json.dumps, lines)) + "\n"
+        for name, text in contents.items():
+            (folder / name).write_text(text)
+    paths = list((tmp_path / "runs" / "methods").rglob("*.json*"))
+    archive = archives / "second-methods.tar.xz"
+    second_study._write_archive(archive, "a test", tmp_path / "runs" / "methods", paths)
+    (row,) = second_tables.claims(archives)
+    assert {title: cell.split(" (")[0] for title, cell in row.items()} == {
+        "method": "vpg",
+        "completion": "40.0 %",
+        "lifts / grasp": "40.0 %",
+        "training success": "70.0 %",
+        "area, 500 actions": "25.0 %",
+        "seconds": "250",
+    }
 
 
 def test_cells_are_recomputed(recorded: Callable[..., Path]):

@@ -1,6 +1,7 @@
 """Settled scenes in C MuJoCo, and their cache."""
 
 import math
+import os
 import stat
 from pathlib import Path
 
@@ -8,12 +9,13 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from scipy import stats
 
 from csac_jax import presets
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.env import MAX_FAILURES, make_env
 from csac_jax.errors import SceneError, SettingsError
-from csac_jax.scenes import certify, constructions, pool
+from csac_jax.scenes import arrange, certify, constructions, pool
 from csac_jax.world import blocks, model, scene_state
 from csac_jax.world.scene_state import SceneState, parking
 from tests.world import placed
@@ -65,6 +67,28 @@ def _assert_at_rest(world: model.World, scenes: SceneState) -> int:
     return touching
 
 
+def _spy(monkeypatch: pytest.MonkeyPatch, module, name: str, note) -> None:
+    """Calls `note` with the name and the arguments before a function."""
+    original = getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *args: [note(name, *args), original(*args)][1])
+
+
+def test_few_scenes_fall_that_are_not_needed(small: Config, monkeypatch: pytest.MonkeyPatch):
+    """Claim: of a round as many scenes fall as are asked for, and at least one on each core; the
+    scenes are the first of those of a larger pool. No two pools of a stream share a scene."""
+    fallen: list[str] = []
+    many = pool.settled(small, pool.TRAIN_STREAM, 6)
+    _spy(monkeypatch, pool, "rest", lambda name, *_: fallen.append(name))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    few = pool.settled(small, pool.TRAIN_STREAM, 3)
+    assert len(fallen) == 3
+    _assert_same(few, jax.tree.map(lambda leaf: leaf[:3], many))
+    assert len(pool.settled(small, pool.TRAIN_STREAM, 1).position) == 1
+    assert len(fallen) == 3 + 2
+    both = many.position, pool.settled(small, 1, 6).position
+    assert len({scene.tobytes() for scenes in both for scene in scenes}) == 12
+
+
 def test_settled_blocks_are_at_rest(scenes: SceneState):
     """Claim: half a second later no block of a settled scene is farther than its speed allows; none
     overlaps another or the table by 2 mm. Blocks in play lie within extent / 2 of the centre, above
@@ -93,6 +117,28 @@ def test_blocks_differ_within_their_ranges(scenes: SceneState):
     ):
         assert low <= drawn.min() < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < drawn.max() <= high
+
+
+@pytest.mark.slow
+def test_same_arguments_same_scenes(scenes: SceneState, monkeypatch, tmp_path: Path):
+    """Claim: the same arguments give the same scenes, bit for bit, also from the cache."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
+    monkeypatch.setattr(pool, "_settle", None)  # must not be called
+    _assert_same(scenes, pool.settled(CONFIG, pool.TRAIN_STREAM, COUNT))
+
+
+def test_scenes_are_made_on_the_cpu(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: what is stored was computed on the CPU, also where JAX's own device is a GPU: dropped
+    scenes and arranged ones."""
+    devices: list[tuple] = []
+    for module, name in ((model, "scene_fields"), (arrange, "arrangements")):
+        note = lambda name, *_: devices.append((name, jax.config.jax_default_device))  # noqa: E731
+        _spy(monkeypatch, module, name, note)
+    cfg = SceneConfig(slots=("box",) * 3, min_blocks=3, packed_fraction=0.5)
+    pool.scenes(Config(scene=cfg), 5, 4)
+    host = jax.devices("cpu")[0]
+    assert {*devices} == {("scene_fields", host), ("arrangements", host)}
 
 
 def test_arrangements_are_kept(cache: Path, monkeypatch: pytest.MonkeyPatch):
@@ -148,6 +194,17 @@ def test_hopeless_configuration_is_one_line(cache: Path, monkeypatch: pytest.Mon
     assert "\n" not in str(error.value)
 
 
+def test_blocks_are_dropped_close_together_or_far_apart():
+    """Claim: each scene has a square of its own in which its blocks are dropped, its side uniform
+    in the range."""
+    cfg = SceneConfig(slots=("box",) * 8, min_blocks=8, drop_extent=(0.1, 0.4))
+    rng = np.random.default_rng(0)
+    reach = np.array([np.abs(pool._drop(cfg, rng, 8).position[:, :2]).max() for _ in range(400)])
+    # The largest of 16 uniform numbers in 0 .. half is 16/17 of half in the mean.
+    assert stats.kstest(reach * 17 / 16, stats.uniform(0.05, 0.15).cdf).statistic < 0.12
+    assert reach.max() <= 0.2
+
+
 KINDS = ("box", "arch", "prism") * 4
 PILE = SceneConfig(slots=KINDS, min_blocks=12, drop_extent=(0.1, 0.1), settle_time=1.0)
 
@@ -167,6 +224,36 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
     again = pool.settled(Config(scene=PILE), 1, 3, poured=True)
     np.testing.assert_array_equal(again.position, scenes.position)
+
+
+def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
+    drop at once, as fewer always did."""
+    falls: list[tuple] = []
+    for way in ("rest", "pour"):
+        _spy(monkeypatch, pool, way, lambda way, *args: falls.append((way, args[2].in_play.sum())))
+    slots = ("box",) * 24
+    scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
+    assert scenes.in_play.shape == (2, 24)
+    assert scenes.in_play.all()
+    assert set(falls) == {("pour", 24)}
+    assert len(falls) <= 6
+    falls.clear()
+    pool.settled(Config(scene=SceneConfig(slots=slots[:12], min_blocks=12)), 0, 1)
+    assert set(falls) == {("rest", 12)}
+
+
+def test_poured_blocks_that_leave_are_dropped_anew():
+    """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives
+    the scene."""
+    cfg = SceneConfig(slots=("box",) * 4, min_blocks=4, drop_extent=(0.448, 0.448), settle_time=1.0)
+    world, rng = model.build(cfg, SimConfig()), np.random.default_rng(0)
+    for _ in range(6):
+        scene = pool._drop(cfg, rng, 4)
+        fields = placed.fields_of(world, scene)
+        poured = pool.pour(world, Config(scene=cfg), scene, fields)
+        assert poured is not None
+        assert (np.linalg.norm(poured.position[:, :2], axis=1) <= 0.5 * EXTENT).all()
 
 
 def test_shipped_scenes_are_what_settling_gives(cache: Path, monkeypatch: pytest.MonkeyPatch):

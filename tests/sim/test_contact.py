@@ -14,6 +14,7 @@ import pytest
 from csac_jax import env as environment, grippers
 from csac_jax.config import Config, SceneConfig, SimConfig
 from csac_jax.constants import Outcome, Primitive
+from csac_jax.errors import SettingsError
 from csac_jax.grippers import Grip
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
@@ -229,3 +230,10 @@ def test_a_double_grasp_takes_both():
     after = jax.jit(env.step)(state, Action.grasp(0.0, 0.0, 0.0))
     assert after.info.cleared == 2
     assert after.info.outcome == Outcome.LIFTED
+
+
+@pytest.mark.parametrize("force", [0.0, -1.0, float("nan")])
+def test_a_force_is_above_0(force: float):
+    """Claim: a force that is no force is one line."""
+    with pytest.raises(SettingsError, match=r"sim\.down_force: must be above 0"):
+        SimConfig(down_force=force)

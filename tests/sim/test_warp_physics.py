@@ -3,11 +3,13 @@
 import functools
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -129,6 +131,23 @@ def test_scripted_primitives_go_as_in_c(ran: Ran):
 
 
 @needs_warp
+def test_what_was_prepared_ahead_is_used(ran: Ran, monkeypatch: pytest.MonkeyPatch):
+    """Claim: scenes that a thread has prepared are not prepared again, and go alike."""
+    from csac_jax.sim import warp_action
+
+    physics = _physics("warp")
+    scenes = len(ran.joints.reachable)
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(simulation.prepare, physics, scenes).result()
+    monkeypatch.setattr(warp_action, "Batch", None)
+    after, trace = jax.jit(jax.vmap(physics.run))(ran.scene, ran.joints)
+    is_far = np.array(list(CASES)) == "kicked"  # metres away, by rounding
+    for rows, atol in ((~is_far, 1e-6), (is_far, 1e-3)):
+        np.testing.assert_allclose(after.position[rows], ran.warp[0].position[rows], atol=atol)
+    np.testing.assert_array_equal(trace.touched, ran.warp[1].touched)
+
+
+@needs_warp
 def test_a_started_primitive_ends_like_one_that_is_run(ran: Ran):
     """Claim: primitives in the background of other work end as without it, but for what the order
     of contacts changes, which depends on timing."""
@@ -150,6 +169,19 @@ def test_a_started_primitive_ends_like_one_that_is_run(ran: Ran):
 
 
 @needs_warp
+def test_nested_vmap_is_a_loop(ran: Ran, run_on_warp: Any):
+    """Claim: seeds of scenes are one batch, with the results of scenes one by one."""
+    scenes, joints = _at(ran.scene, np.array([[4, 5], [4, 6]])), _at(ran.joints, [4, 5])
+    nested = jax.jit(jax.vmap(jax.vmap(run_on_warp), in_axes=(0, None)))(scenes, joints)
+    one = jax.jit(run_on_warp)
+    close = functools.partial(np.testing.assert_allclose, atol=1e-4)
+    for seed in range(2):
+        for row in range(2):
+            alone = one(_at(scenes, (seed, row)), _at(joints, row))
+            jax.tree.map(close, _at(nested, (seed, row)), alone)
+
+
+@needs_warp
 def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
     """Claim: sizes, masses and frictions are those of each scene."""
     rows = [0, 0, 4, 4]  # a cube that slides while nothing is grasped, a cube that is lifted
@@ -166,6 +198,21 @@ def test_scenes_have_their_own_blocks(ran: Ran, run_on_warp: Any):
     ends = np.asarray(after_c.position)[:, 0, 0]
     assert ends[1] - ends[0] > 5e-3  # the more friction, the nearer
     assert trace_c.gap_end[3] - trace_c.gap_end[2] > 5e-3
+
+
+@needs_warp
+def test_nothing_is_left_from_another_action(ran: Ran, run_on_warp: Any):
+    """Claim: a compiled program gives what its arguments say, whatever ran before it."""
+    run = jax.jit(jax.vmap(run_on_warp))
+    names = list(CASES)
+    first = [names.index("lifted"), names.index("nan")]
+    second = [names.index("push"), names.index("nothing")]
+    before = _at((ran.scene, ran.joints), first)
+    between = _at((ran.scene, ran.joints), second)
+    results = [jax.tree.map(np.array, run(*each)) for each in (before, between, before)]
+    close = functools.partial(np.testing.assert_allclose, atol=1e-5)
+    jax.tree.map(close, results[0], results[2])
+    jax.tree.map(close, results[1], _at(ran.warp, second))
 
 
 @needs_warp
@@ -256,3 +303,17 @@ def test_held_objects_hang_as_in_c(tmp_path: Path):
     )
     assert trace.held.all()
     np.testing.assert_allclose(after.position, after_c.position, atol=5e-4)
+
+
+@needs_warp
+def test_many_objects_fit_on_warp():
+    """Claim: Warp takes scenes of more objects than its dense matrices hold."""
+    scene = {"slots": ("object",) * 10, "min_blocks": 10, "objects": "procedural:0:12"}
+    cfg = presets.get("objects").change(scene=scene, sim={"physics": "warp"})
+    world = model.build(cfg.scene, cfg.sim)
+    from csac_jax.sim import warp_action
+
+    placed, _ = warp_action._put(world.model, cfg.sim, 1, warp_action.fields(world, cfg.sim))
+    assert placed.nv == 66
+    assert placed.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    assert placed.opt.iterations == warp_action.CONE_EFFORT
