@@ -248,4 +248,3 @@ def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(given) == 2
     assert ASKED in capsys.readouterr().err
     assert not program_file.exists()
-    assert main([*given, "--gripper", "2f85"]) == 0

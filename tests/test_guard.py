@@ -83,16 +83,6 @@ def test_rows_are_right():
     assert float(done.stdout) < 1e-5, done.stderr
 
 
-def test_flags_of_the_user_are_kept():
-    """Claim: the user's XLA flags stay, and the guard's own is not repeated."""
-    source = "import csac_jax, os; print(os.environ['XLA_FLAGS'])"
-    known = importlib.metadata.version("jaxlib").startswith(_guard.FUSION_SERIES)
-    theirs, ours = "--xla_cpu_multi_thread_eigen=false", f"{_guard.FUSION_FLAG}=INDIVIDUAL_DOT"
-    added = [f"{_guard.FUSION_FLAG}="] if known else []
-    assert _python(source, XLA_FLAGS=theirs).stdout.split() == [theirs, *added]
-    assert _python(source, XLA_FLAGS=ours).stdout.split() == [ours]
-
-
 def test_unknown_jaxlib_gets_no_flag(monkeypatch: pytest.MonkeyPatch):
     """Claim: a jaxlib that may lack the flag is not given it: XLA ends the process on a flag it
     does not know."""

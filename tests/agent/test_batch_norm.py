@@ -11,7 +11,7 @@ import optax
 import pytest
 from numpy.testing import assert_allclose
 
-from csac_jax.agent import actor, actor_critic, critic, values
+from csac_jax.agent import actor_critic, critic, values
 from csac_jax.agent.actor_critic import ActorCritic, LearnerState
 from csac_jax.agent.learner import Transition
 from csac_jax.config import DenseNet121
@@ -141,14 +141,3 @@ def test_gradients_change_parameters_only(learner, state, batch, update, updated
         moments = jax.tree.leaves(getattr(fresh, f"{net}_optimiser"))  # Adam's, two vectors
         num = sum(leaf.size for leaf in params)
         assert [leaf.size for leaf in moments if leaf.ndim] == [num, num]
-
-
-@pytest.mark.slow
-def test_the_actors_update_moves_its_own_statistics(learner, state, batch):
-    """Claim: an update of the actor moves its own parameters and statistics alone."""
-    obs = heightmap.unpack(batch.obs)
-    after, _ = jax.jit(lambda state: actor.update(learner, state, obs))(state)
-    before, moved = state.online.actor, after.online.actor
-    assert not _same(before["batch_stats"], moved["batch_stats"])
-    assert np.any(before["params"]["conv1"]["kernel"] != moved["params"]["conv1"]["kernel"])
-    assert _same((state.online.critic, state.target), (after.online.critic, after.target))

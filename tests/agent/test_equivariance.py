@@ -13,7 +13,6 @@ from csac_jax.agent import actor_critic, maps, values
 from csac_jax.agent.actor_critic import ActorCritic
 from csac_jax.agent.maps import DenseMaps
 from csac_jax.config import DenseNet121, HeightmapConfig, SmallNet
-from csac_jax.nets import dense
 from csac_jax.vision.heightmap import Observation
 from tests.sections import with_constants
 
@@ -105,7 +104,7 @@ def _value(fixed: Fixed, seen: DenseMaps, primitive: int, pose: np.ndarray) -> f
     return float(maps.read(fixed.learner.frames, seen.q[0], *at))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_quarter_turn(net, seed):
     """Claim: of a scene turned by a quarter turn each net's maps are the same, a quarter turn on,
     and its best action is the turned one, among yaws whose pass does not turn upside down with
@@ -122,7 +121,7 @@ def test_quarter_turn(net, seed):
     assert_allclose(turned, _turned(pose, 0.5 * np.pi), atol=1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_one_yaw_step(net, seed):
     """Claim: of a smooth scene turned by one yaw step, 30 degrees here, maps change by a twentieth
     of their spread at most, those of DenseNet by a quarter, for cells are the nearest ones; and the
@@ -135,32 +134,3 @@ def test_one_yaw_step(net, seed):
     (primitive, pose), (other, best) = _best(net, before, first), _best(net, after, first + 1)
     worth = _value(net, after, primitive, _turned(pose, 2.0 * np.pi / K))
     assert worth > _value(net, after, other, best) - bound
-
-
-def _symmetric(params: Any) -> Any:
-    """Makes the small net blind to a half turn: symmetric kernels, a push back as one ahead."""
-
-    def fold(path: Any, leaf: jax.Array) -> jax.Array:
-        if leaf.ndim >= 4 and path[-1].key == "kernel":  # [M, k, k, I, O] of the critic
-            return 0.5 * (leaf + leaf[..., ::-1, ::-1, :, :])
-        return leaf.at[..., 1].set(leaf[..., 0]) if leaf.shape[-1] == dense.OUTPUTS else leaf
-
-    return jax.tree_util.tree_map_with_path(fold, params)
-
-
-@pytest.mark.parametrize("net", ["small"], indirect=True)
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_every_yaw_of_a_symmetric_net(net, quarters):
-    """Claim: of a small net that is blind to half turns, as the gripper is, all maps of all yaws
-    turn with the scene.
-
-    The features of DenseNet-121 do not lie symmetrically in its input: it has to learn this.
-    """
-    params, obs = _symmetric(net.params), _hills(0, 0.0)
-    before = net.look(params, obs)
-    for _ in range(quarters):
-        obs = _quarter(obs)
-    after = net.look(params, obs)
-    for name in ("q", "valid"):
-        maps_before, maps_after = (np.asarray(getattr(seen, name)) for seen in (before, after))
-        assert_allclose(np.roll(maps_before, quarters * QUARTER, axis=2), maps_after, atol=1e-5)

@@ -108,24 +108,3 @@ def test_best_grasps_are_those_of_all(learner, randomised, observations, num):
         wanted = np.random.default_rng(seed).random(num) < 0.5
         expected = np.where(wanted, phi, 0.0)
         assert_allclose(best_grasps(jnp.asarray(wanted)), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_replicas_ask_for_the_neediests_quarters(learner, randomised, observations, monkeypatch):
-    """Claim: under vmap phi_g is what it is alone, in as many quarters as one replica asks for."""
-    state = randomised(_begun(learner))
-    obs, dense_maps = observations(8, 3), values.dense_maps
-    wanted = np.zeros((3, 8), bool)
-    wanted[0, [1, 6]] = wanted[1, [0, 3, 7]] = True  # one quarter of two, two quarters, none
-    phi = jax.vmap(values.best_grasp)(jax.jit(lambda: dense_maps(learner, state.target, obs))())
-    passed: list[int] = []
-
-    def counted(*args):
-        jax.debug.callback(lambda: passed.append(1))
-        return dense_maps(*args)
-
-    monkeypatch.setattr(values, "dense_maps", counted)
-    ask = functools.partial(values.best_grasps, learner, state.target, obs)
-    got = jax.jit(jax.vmap(ask))(jnp.asarray(wanted))
-    jax.effects_barrier()
-    assert_allclose(got, np.where(wanted, phi, 0.0), rtol=1e-4, atol=1e-5)
-    assert len(passed) == 2

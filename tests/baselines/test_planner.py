@@ -57,27 +57,20 @@ def _step(cfg):
 
 
 @functools.cache
-def _tried(cfg, num: int):
-    def tried(state: State, key: jax.Array):
-        grasps = planner.sample_grasps(key, state.scene, num)
-        physics = planner.make_physics(cfg)
-        return grasps, trials.simulate(cfg, physics, state.scene, state.obs.height, grasps)
-
-    return jax.jit(tried)
+def _simulate(cfg):
+    simulate = jax.jit(functools.partial(trials.simulate, cfg, planner.make_physics(cfg)))
+    return lambda state, actions: simulate(state.scene, state.obs.height, actions)
 
 
 def test_trials_are_steps_of_the_environment():
     """Claim: a trial has the effect of the environment's step, bit for bit; its blocks lifted, lost
     and wanted are the environment's."""
     state = _start(CFG)
-    grasps, tried = _tried(CFG, 16)(state, jax.random.key(1))
+    grasps = planner.sample_grasps(jax.random.key(1), state.scene, 16)
+    pushes = planner.sample_pushes(jax.random.key(2), CFG, state.scene, 16)
+    tried, pushed = (_simulate(CFG)(state, actions) for actions in (grasps, pushes))
     assert 0 < int(tried.wanted.any(axis=1).sum()) < 16
-    pushes = planner.sample_pushes(jax.random.key(2), CFG, state.scene, 4)
-    simulate = jax.jit(functools.partial(trials.simulate, CFG, planner.make_physics(CFG)))
-    for actions, effects in (
-        (grasps, tried),
-        (pushes, simulate(state.scene, state.obs.height, pushes)),
-    ):
+    for actions, effects in ((grasps, tried), (pushes, pushed)):
         for number in range(4):
             action, effect = jax.tree.map(lambda leaf, i=number: leaf[i], (actions, effects))
             after = _step(CFG)(state, action)
@@ -103,7 +96,8 @@ def test_planner_pushes_towards_a_grasp():
     """Claim: where no grasp lifts the target, the planner takes the push after which the most
     grasps do, and one that changes nothing is not it."""
     state, physics = _start(TARGET, MIDDLE), planner.make_physics(TARGET)
-    grasps, tried = _tried(TARGET, FEW.grasps)(state, jax.random.key(5))
+    grasps = planner.sample_grasps(jax.random.key(5), state.scene, FEW.grasps)
+    tried = _simulate(TARGET)(state, grasps)
     assert not np.any(tried.wanted)
     pushes = planner.sample_pushes(jax.random.key(0), TARGET, state.scene, FEW.pushes)
     in_the_air = Action.push(0.2, 0.2, 0.0)

@@ -1,6 +1,5 @@
 """The command line: bad input is one line and an exit code, and nothing is overwritten."""
 
-import dataclasses
 import hashlib
 import json
 import logging
@@ -8,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import types
 import warnings
 from pathlib import Path
 from typing import Any
@@ -18,15 +16,14 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, api, cli, presets
-from csac_jax.cli import bench, evaluate, failures, output, play, settings, sweep, train
+from csac_jax.cli import evaluate, settings, sweep, train
 from csac_jax.config import BetaReplay, Config, DenseNet121, UniformReplay
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.evaluation import policies, rollout, suites
+from csac_jax.evaluation import policies, suites
 from csac_jax.io import checkpoint
-from csac_jax.runtime import signals
+from csac_jax.runtime import modules, signals
 from csac_jax.section import Section
 from csac_jax.sweeps import runner
-from csac_jax.training import memory
 from csac_jax.training.callbacks import RunInfo, RunRecord, Summary
 from csac_jax.training.progress import Terminal
 
@@ -75,33 +72,21 @@ def run_dir(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            "trian quick",
-            "'trian'; did you mean train? choose one of: demo, train, sweep, eval, play",
-        ),
+        ("trian quick", "'trian'; did you mean train? choose one of: demo, train, sweep"),
         ("train --seed 3", "give a preset first, one of: smoke, quick"),
-        ("train smoke --eval-suite cases", "--eval-suite: give it with --eval-every N"),
         ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
         ("train quick --learn.bath 3", "--learn.bath 3; perhaps you meant --learn.batch; see csac"),
         ("train quick --learn.tau 2", "learn.tau: must be at most 1, not 2.0"),
-        ("train quick --scene.slots box ball", "--scene.slots: 'ball' is not one of: box, arch"),
-        ("train quick --replay.sampler best", "replay.sampler: 'best' is not one of: uniform"),
         ("train quick --net.norm=batch", "--net.norm=batch: --net.kind small has no such setting"),
         ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
         ("train quick smoke", "unknown arguments: smoke"),
-        ("train quick --algo csac_bta", "unknown algorithm 'csac_bta'; did you mean csac_beta?"),
-        ("train quick --run-dir .", ". exists; give another --run-dir"),
         ("train smoke --sim.physics warp --scene.size-jitter 0.1 0", "warp computes on CUDA"),
-        ("train smoke --sim.gripper rg3", "sim.gripper: 'rg3' is neither one of 2f85, franka_hand"),
         ("eval", "these arguments are missing: source"),
         ("eval . --episodes 0", "--episodes: at least 1"),
         ("eval shipped --which worst", "--which: 'worst' is neither best, last nor a step"),
-        ("eval shipped --sensor.kind d415", "sensor.kind: must be none where heightmap.view is"),
         ("eval shipped --suite nowhere", "'nowhere' is neither a case file nor one of: in_distr"),
-        ("doctor --preset", "--preset: a value is missing"),
         ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
         ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
-        ("bench step --learn.tau 2", "bench step: learn.tau: must be at most 1"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -176,22 +161,6 @@ def test_resume_takes_the_config_of_the_run(tmp_path: Path, command: str):
     assert (options.resume, resumed) == (folder, cfg)
 
 
-@pytest.mark.parametrize("command", ["train", "sweep"])
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("nothing", "there is no folder nothing; give the folder of a run, a policy file"),
-        ("bad.safetensors", "bad.safetensors cannot be read as .safetensors"),
-    ],
-)
-def test_nothing_to_start_from(
-    capsys: pytest.CaptureFixture, command: str, source: str, message: str
-):
-    """Claim: --init of what holds no networks is one line and exit code 1."""
-    Path("bad.safetensors").write_bytes(b"bad")
-    _fails(capsys, 1, f"{command} smoke --init {source}", message)
-
-
 def test_networks_of_other_settings(capsys: pytest.CaptureFixture):
     """Claim: --init brings the settings of its networks, and as many cells as they learned with,
     unless options say otherwise; other networks given as options are refused."""
@@ -226,13 +195,6 @@ def test_flags_reach_the_config(flags: str, changes: dict[str, Any]):
     """Claim: settings on the command line reach the config, the rest is the preset's;
     --replay.sampler and --net.kind choose their section, which keeps what both have."""
     assert train.read(["smoke", *flags.split()])[1] == SMOKE.change(**changes)
-
-
-@pytest.mark.parametrize("flags", ["--target.gamma 0.3 --algo vpg", "--algo=vpg --target.gamma .3"])
-def test_algorithm_reaches_the_config(flags: str):
-    """Claim: --algo makes the preset one of that algorithm; settings given as well win over it."""
-    wanted = algorithms.configure(SMOKE, "vpg").change(target={"gamma": 0.3})
-    assert train.read(["smoke", *flags.split()])[1] == wanted
 
 
 @pytest.fixture
@@ -300,14 +262,11 @@ def _help(capsys: pytest.CaptureFixture, *arguments: str) -> str:
     return capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", ["train", "sweep"])
-def test_every_setting_is_a_flag(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: str
-):
+def test_every_setting_is_a_flag(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: --help-all shows every setting of a config as a flag with its meaning, those of the
     chosen alternative among them."""
     monkeypatch.setenv("COLUMNS", "200")
-    shown = _help(capsys, command, "quick", "--help-all", "--replay.sampler", "uniform")
+    shown = _help(capsys, "train", "quick", "--help-all", "--replay.sampler", "uniform")
     cfg = presets.quick().change(replay={"sampler": "uniform"})
     sections = [one for one in vars(cfg).values() if isinstance(one, Section)]
     assert len(sections) == 15
@@ -318,18 +277,6 @@ def test_every_setting_is_a_flag(
     assert "--preset" not in shown
     assert "--replay.end" not in shown
     assert "Fewest blocks in play in a scene" in shown
-
-
-@pytest.mark.parametrize("arguments", ["train --seed 3", "sweep fast"])
-def test_short_help(capsys: pytest.CaptureFixture, arguments: str):
-    """Claim: --help has every preset and option, and of the settings those alone that people change
-    first; it comes before all errors."""
-    shown = _help(capsys, *arguments.split(), "-h")
-    options = train.TrainOptions if arguments.startswith("train") else sweep.SweepOptions
-    names = [field.name.replace("_", "-") for field in dataclasses.fields(options)]
-    assert all(f"--{name}" in shown for name in (*names, "train.actions"))
-    assert all(name in shown for name in presets.PRESETS)
-    assert "--cem.rounds" not in shown
 
 
 def test_examples_of_the_help_are_read(run_dir: Path, config_file: Path):
@@ -426,30 +373,6 @@ def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("stats", [None, {}, {"bytes_limit": 10**9}])
-def test_limit_of_the_device_goes_first(monkeypatch: pytest.MonkeyPatch, stats: Any):
-    """Claim: a device that states its memory is believed, this machine's own counts for one that
-    does not."""
-    device = types.SimpleNamespace(memory_stats=lambda: stats)
-    monkeypatch.setattr(memory.jax, "devices", lambda: [device])
-    own = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert memory.limit() == (10**9 if stats else own)
-
-
-def test_benchmark_is_run_with_its_arguments(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    """Claim: `bench NAME ...` calls `main` of that file of the checkout."""
-    monkeypatch.setattr(bench, "BENCHMARKS", tmp_path)
-    _fails(capsys, 2, "bench one")
-    Path("one.py").write_text("def main(arguments):\n    print(arguments)\n")
-    Path("_helper.py").write_text("")
-    assert cli.main(["bench", "one", "a", "--b"]) == 0
-    assert cli.main(["bench", "--help"]) == 0
-    shown = "usage: csac-jax bench NAME ..., with NAME one of: one\n"
-    assert capsys.readouterr().out == f"['a', '--b']\n{shown}"
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
@@ -533,6 +456,7 @@ def test_commands_load_modules(
     for module, name in ((presets, "PRESETS"), (algorithms, "ALGORITHMS"), (suites, "SUITES")):
         monkeypatch.setattr(module, name, dict(getattr(module, name)))
     monkeypatch.setattr(policies, "BASELINES", dict(policies.BASELINES))
+    monkeypatch.setattr(modules, "_loaded", {})
     monkeypatch.setattr(sys, "path", [*sys.path])
     Path("my_module.py").write_text(MODULE)
     trained: list[Any] = []
@@ -630,22 +554,6 @@ def test_doctor_shows_memory(
     assert result["memory"]["bytes"]["replay"] == 128 * transition + 8
 
 
-def test_doctor_builds_kernels(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `doctor --build` makes what Warp needs for as many scenes as the preset has."""
-    from csac_jax.sim import physics, selftest, warp_physics
-
-    made: list[int] = []
-    fake = types.SimpleNamespace(prepared=made.append)
-    make = lambda world, cfg: warp_physics.WarpPhysics(world, fake)  # noqa: E731
-    monkeypatch.setitem(physics.PHYSICS, "warp", make)
-    monkeypatch.setattr(failures, "check_physics", lambda cfg: None)
-    monkeypatch.setattr(selftest, "CHECKS", ())
-    flags = "--build --sim.physics warp --train.scenes 64"
-    assert cli.main(["doctor", *flags.split()]) == 0
-    assert made == [64]
-    assert "for 64 scenes of fast on Warp" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize("error", [1.0, float("nan")])
 def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, error: float):
     """Claim: a check that fails, or gives NaN, is exit code 1 and one line that names it."""
@@ -657,32 +565,3 @@ def test_doctor_fails(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyP
     captured = capsys.readouterr()
     assert captured.err.count("\n") == 1
     assert "self-test failed: sums;" in captured.err
-
-
-def test_progress_is_for_terminals(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
-    """Claim: `eval` says how many episodes are over on a terminal, and nothing elsewhere."""
-    monkeypatch.setenv("TERM", "xterm")
-    for terminal in ("", "1"):
-        monkeypatch.setenv("FORCE_COLOR", terminal)  # Rich takes this for a terminal
-        with output.progress() as bars:
-            evaluate._shown(bars)("cases", "row", 3, 50)
-        shown = capsys.readouterr()
-        assert shown.out == ""
-        assert ("row" in shown.err and "3/50" in shown.err) == bool(terminal)
-        assert bool(shown.err) == bool(terminal)
-
-
-@pytest.mark.parametrize(("scene", "any_yaw"), [("row", False), ("random", True)])
-def test_play_shows_a_case_as_it_is(monkeypatch: pytest.MonkeyPatch, scene: str, any_yaw: bool):
-    """Claim: `play` turns a case by quarters at most, so that it can be known again, and a random
-    scene by any yaw."""
-    turned = []
-
-    def episode(env, *_):
-        turned.append(env.any_yaw)
-        yield from ()
-
-    monkeypatch.setattr(rollout, "episode", episode)
-    monkeypatch.setattr("csac_jax.render.episode.summary", lambda *_: "")
-    play._play(play.PlayOptions(scene=scene), policies.OraclePolicy(SMOKE), {})
-    assert turned == [any_yaw]

@@ -132,6 +132,7 @@ def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     which its options can be sent."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
+    monkeypatch.setattr(evaluate.modules, "_loaded", {})
     Path("my_empty.py").write_text("")
     tasks: list[tuple] = []
 

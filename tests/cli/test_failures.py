@@ -166,25 +166,6 @@ def test_export_overwrites_nothing(capsys: pytest.CaptureFixture):
     assert Path("p.safetensors").read_text() == "mine"
 
 
-@pytest.mark.parametrize(("encoding", "columns"), [("utf-8", None), ("ascii", "40"), ("ascii", "")])
-def test_error_is_the_same_on_any_terminal(
-    capsys: pytest.CaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    encoding: str,
-    columns: str | None,
-):
-    """Claim: the parser's error is the whole message in one line, however wide the terminal is and
-    whatever it can draw; the terminal's width stays what it was."""
-    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
-    monkeypatch.delenv("COLUMNS", raising=False)
-    if columns is not None:
-        monkeypatch.setenv("COLUMNS", columns)
-    _, _, line = _run(capsys, f"train quick {'x' * 60}")
-    more = "see csac-jax train quick --help-all"
-    assert line == f"csac-jax: unknown arguments: {'x' * 60}; {more}\n"
-    assert os.environ.get("COLUMNS") == columns
-
-
 def test_watchdog_barks(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch):
     """Claim: a self-test that hangs ends the process with one line and exit code 1; after one that
     ends in time nothing waits any more."""

@@ -20,7 +20,7 @@ from csac_jax.training import programs, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
-TAUS = ",".join(f"0.{i:03d}" for i in range(100, 125))
+TAUS = ",".join(f"0.{i:03d}" for i in range(100, 205))
 RUN = runner.run
 
 
@@ -48,29 +48,22 @@ def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: st
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("smoke --seeds 0", "--seeds: at least 1"),
         ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
         ("smoke --vary replay.sampler=uniform --replay.end 1 4", "uniform has no such setting"),
         ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --vary learn.tau=0.1,0.10", "vary: two settings have the same values"),
         ("smoke --devices 4096", "devices: 4096 asked for, there are "),
         ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores"),
         (
             "smoke --replay.capacity 65536 --seeds 9999",
             "lower seeds, set together or raise devices",
         ),
-        ("smoke --seeds 5001 --vary learn.tau=0.1,0.2", "seeds: 1 to 10000 runs in all"),
-        (
-            f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS} --vary policy.retry={TAUS}",
-            "vary: more than 10000 combinations",
-        ),
+        (f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS}", "more than 10000"),
         ("smoke --cluster", "several processes need --run-dir"),
         (
             "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
             "process_id: must lie in 0 .. 1",
         ),
         ("--resume x --learn.tau 0.1", "leave all others out"),
-        ("quick --resume x", "leave all others out"),
     ],
 )
 def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
@@ -225,14 +218,3 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
         "base/seed-1",
     ]
     assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2
-
-
-def test_devices_of_other_processes_count():
-    """Claim: C's physics, for one device, is neither chosen nor allowed where processes or devices
-    are several."""
-    several = ({"devices": 2}, {"processes": 2}, {"cluster": True}, {"devices": 1, "processes": 2})
-    assert all(command._devices(command.SweepOptions(**options)) > 1 for options in several)
-    assert {
-        command._devices(command.SweepOptions(**one))
-        for one in ({}, {"devices": 1}, {"processes": 1})
-    } == {1}

@@ -1,6 +1,5 @@
 """The printed board against poses that are known, and what is refused."""
 
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -47,14 +46,6 @@ def test_board_on_the_table(lens: images.Intrinsics):
     assert turn < 0.1
     assert len(found.residual_mm) >= 20
     assert found.residual_mm.max() < 0.3
-
-
-def test_residual_tells_a_wrong_lens():
-    """Claim: a focal length that is 14 % off makes the residual three times as large."""
-    image = boards.take(BOARD, ON_TABLE)
-    longer = dataclasses.replace(boards.LENS, fx=700.0, fy=700.0)
-    right, wrong = (board.locate(BOARD, image, lens) for lens in (boards.LENS, longer))
-    assert wrong.residual_mm.mean() > 3.0 * right.residual_mm.mean()
 
 
 CAMERA = _rigid(Rotation.from_euler("xyz", [150, 10, 80], degrees=True), [0.6, -0.2, 0.9])

@@ -79,9 +79,7 @@ def test_pose_that_sees_no_workspace(pose: np.ndarray, hint: str):
         _check(pose=pose)
 
 
-@pytest.mark.parametrize(
-    ("shift_mm", "turn_deg"), [(20.0, 0.0), (-15.0, 0.0), (0.0, 3.0), (10.0, -2.0), (30.0, 5.0)]
-)
+@pytest.mark.parametrize(("shift_mm", "turn_deg"), [(20.0, 0.0), (0.0, 3.0), (10.0, -2.0)])
 def test_table_is_measured(shift_mm: float, turn_deg: float):
     """Claim: height and tilt of a table that is not at z = 0 are told, to 0.5 mm and 0.1 degrees,
     objects and depth noise notwithstanding."""

@@ -116,7 +116,6 @@ def test_new_entries_come_last(folder: Path, monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize(
     ("name", "outcome", "number", "message"),
     [
-        ("000003", "lifted", 1, "there is no decision 000003"),
         ("../record", "lifted", 1, "there is no decision ../record"),
         ("000001", "lifted", 3, "number: there are 2 decisions, not 3"),
         ("000001", "pushed", 1, "outcome: of a grasp it is nothing, empty"),
@@ -135,12 +134,8 @@ def test_outcomes_that_do_not_fit(folder: Path, name: str, outcome: str, number:
     [
         ("record.json", None, "is no record: it has no record.json"),
         ("record.json", '{"format": 2}', "format 2 is unknown, this version reads 1; update"),
-        ("000002/decision.json", None, "there is no file .*000002/decision.json"),
         ("000001/decision.json", '{"decisions": [{"prim', "000001/decision.json: Invalid JSON"),
-        ("000001/decision.json", '{"decisions": [{"primitive": "grasp"}]}', "position' is missing"),
         ("000001/outcome.json", '{"outcome": "good"}', "json: 'outcome' should be 'nothing'"),
-        ("000001/outcome.json", '{"outcome": "lifted", "speed": 1}', "'speed' is unknown"),
-        ("000001/outcome.json", '{"outcome": "lifted", "number": "1"}', "'number' should be a"),
         ("000001/outcome.json", '{"outcome": "lifted", "number": 0}', "'number' should be greater"),
     ],
 )

@@ -56,30 +56,6 @@ def test_first_good_push_is_recorded(rows: int):
     assert round(100 * certificate.after, 6) % 1 == 0
 
 
-class TwoSides(Toy):
-    """As Toy, but a push to the right, too, opens the scene; one to the left moves one block."""
-
-    def trial(self, scenes, heights, actions):
-        wanted, lost, after = super().trial(scenes, heights, actions)
-        poses = np.asarray(actions.pose)
-        right = (np.asarray(actions.primitive) == Primitive.PUSH) & (np.cos(poses[:, 2]) > 0.9)
-        friction = np.where(right[:, None], np.float32(OPENED), after.friction)
-        position = after.position + 0.0
-        position[right, :, 0] += 0.1  # all blocks alike
-        position[after.friction[:, 0] == OPENED, 0, 0] -= 0.05
-        return wanted, lost, after.replace(friction=friction, position=position)
-
-
-def test_pushes_that_part_blocks_come_first():
-    """Claim: of pushes that open a scene, one that moves a block from the others is recorded before
-    one that moves all alike."""
-    certificate = certification.judge(TwoSides().lab(), _scene(), "bars", SEED)
-    pushes = planner.sample_pushes(jax.random.key(SEED), CFG, _scene(), certification.PUSHES)
-    right = np.flatnonzero(np.cos(pushes.pose[:, 2]) > 0.9)
-    assert certificate.push == np.flatnonzero(np.cos(pushes.pose[:, 2]) < -0.9)[0]
-    assert right[0] < certificate.push
-
-
 def test_pads_have_the_friction_of_these_scenes():
     """Claim: the grip of a certificate is the config's; scenes are handed on without it."""
     one, two = (

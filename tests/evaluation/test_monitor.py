@@ -238,13 +238,3 @@ def test_plan_that_cannot_be_is_refused(plan: EvalPlan):
     with pytest.raises(ValueError, match=r"at least 1|neither a case file") as caught:
         plan.check()
     assert "\n" not in str(caught.value)
-
-
-def test_worlds_of_training_become_one(monkeypatch: pytest.MonkeyPatch):
-    """Claim: a training with many hands is watched with the RG2, as `eval` measures its policy."""
-    asked = []
-    monkeypatch.setattr(monitor.suites, "prepare", lambda cfg, *_, **__: asked.append(cfg))
-    many = CFG.change(sim={"gripper": "varied"})
-    for suite in ("random10", monitor.suites.IN_DISTRIBUTION):
-        Monitor(many, EvalPlan(1, suite, 1), lambda _: None, (), print)
-    assert [cfg.sim.gripper for cfg in asked] == ["rg2", "varied"]

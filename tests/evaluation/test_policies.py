@@ -90,34 +90,6 @@ def test_mirror_images_reach_the_policy(learned, states):
     assert np.abs(plain.batched(states, _keys()).pose - expected).max() > 0.005
 
 
-def test_height_bonus_leads_to_the_top(states):
-    """Claim: with a large `policy.height_bonus` a policy, and a learner that explores or does not,
-    grasp within a cell and a half of a tower, which they do not without."""
-    off = CFG.change(
-        policy={"place": "argmax", "primitive": "grasp"},
-        explore={"push_fraction": 0.0, "noise_std": 0.0, "epsilon_place": (0.0, 0.0)},
-    )
-    cfg, key = off.change(policy={"height_bonus": 100.0}), jax.random.key(0)
-    parts = actor_critic.make(cfg)
-    state = jax.jit(lambda key: actor_critic.init(key, parts))(key)
-    towers = np.array([[4, 26], [12, 20], [18, 4]])  # rows, columns
-    height = np.asarray(states.obs.height).copy()
-    for scene, (row, col) in zip(height, towers, strict=True):
-        scene[row - 1 : row + 2, col - 1 : col + 2] = 0.15
-    states = states.replace(obs=states.obs.replace(height=jnp.asarray(height)))
-    centres = (towers[:, ::-1] + 0.5) * cfg.heightmap.cell - 0.5 * cfg.heightmap.extent  # x, y
-
-    def is_near(pose: jax.Array) -> np.ndarray:
-        return np.abs(np.asarray(pose)[:, :2] - centres).max(axis=-1) < 1.5 * parts.frames.cell
-
-    plain, high = (NetworkPolicy(one, state.online).batched(states, _keys()) for one in (off, cfg))
-    assert not is_near(plain.pose).any()
-    assert is_near(high.pose).all()
-    for taken in (None, jnp.int32(9)):
-        explore = key, state, states.obs, states.steps_without_change, taken
-        assert is_near(csac.CSAC(parts).act(*explore).pose).all()
-
-
 def test_failures_lead_to_other_places(learned, states):
     """Claim: with `policy.retry_temperature` an action after failed grasps is drawn, another for
     another key; without failures, or from an observation, it is the best one."""
@@ -165,20 +137,6 @@ def test_policies_are_pure(kind, states):
         one = kind(CFG)(_scene(states, number), _keys()[number])
         assert one.primitive == batch.primitive[number]
         np.testing.assert_allclose(one.pose, batch.pose[number], atol=1e-6)
-
-
-def test_debug_is_of_the_action(learned, states):
-    """Claim: the debug view of a state holds the best grasp's value that the agent sees, and
-    candidates next to the action."""
-    state = _scene(states, 0)
-    seen, action = (look(state, jax.random.key(2)) for look in (learned.debug, learned))
-    parts, obs = actor_critic.make(CFG), jax.tree.map(lambda leaf: leaf[:1], states.obs)
-    dense_maps = jax.jit(lambda obs: values.dense_maps(parts, learned.params, obs))(obs)
-    (best,) = jax.vmap(values.best_grasp)(dense_maps)
-    np.testing.assert_allclose(seen.best_grasp, best, rtol=1e-5)
-    assert seen.q.shape == (2, CFG.heightmap.size, CFG.heightmap.size)
-    places = seen.candidates[Primitive.GRASP, :, :2]
-    assert np.linalg.norm(places - action.pose[:2], axis=1).min() < 2 * CFG.heightmap.cell
 
 
 def test_load_reads_a_file(tmp_path, learned):

@@ -1,7 +1,6 @@
 """Episodes of fixed policies."""
 
 import dataclasses
-import heapq
 import types
 import warnings
 from typing import Any, ClassVar
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.agent import actor_critic
 from csac_jax.config import SensorConfig, TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
@@ -63,26 +61,9 @@ class Magnet(Env):
         )
 
 
-class StrongMagnet(Magnet):
-    """Pushes take blocks too, and from so far that other places take other blocks."""
-
-    reach = 0.05
-
-    def step(self, state: State, action: Action) -> State:
-        grasp = jnp.full_like(action.primitive, Primitive.GRASP)
-        return super().step(state, action.replace(primitive=grasp))
-
-
 def _compiled(env: Env):
     """What rollouts in this environment call, see `rollout._compiled`."""
     return rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
-
-
-def learned_policy(seed: int) -> NetworkPolicy:
-    """Networks as they begin."""
-    parts = actor_critic.make(CFG)
-    state = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(seed))
-    return NetworkPolicy(CFG, state.online)
 
 
 @pytest.fixture(scope="module")
@@ -169,19 +150,6 @@ def test_batches_do_not_matter(magnet, random, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, random, apart)
 
 
-@pytest.mark.slow
-def test_networks_are_arguments(magnet):
-    """Claim: other weights of the same networks compile nothing again, and act otherwise."""
-    strong = StrongMagnet(magnet.cfg, magnet.physics, magnet.scenes)
-    first, other = (learned_policy(seed) for seed in (0, 1))
-    one = rollout.rollout(strong, first, EPISODES, 0)
-    assert_consistent(rollout.rollout(magnet, first, EPISODES, 0), CFG.task.max_actions)
-    compiled = _compiled(strong)[1]._cache_size()
-    two = rollout.rollout(strong, other, EPISODES, 0)
-    assert _compiled(strong)[1]._cache_size() == compiled
-    assert any(not np.array_equal(a, b) for a, b in zip(one, two, strict=True))
-
-
 def test_policies_of_equal_fields_are_told_apart(magnet, monkeypatch):
     """Claim: what a policy's program is found by holds its type: JAX takes the structures of
     dataclasses with equal fields for equal, and runs the program of the one for the other where
@@ -218,20 +186,6 @@ def test_function_is_a_policy(magnet):
         again = rollout.rollout(magnet, own, EPISODES, 0)
         jax.tree.map(np.testing.assert_array_equal, episodes, again)
     assert calls == [State]
-
-
-def test_progress_counts_finished_episodes(magnet, monkeypatch):
-    """Claim: progress is told after every action how many episodes are over, at last all; one that
-    ends makes room for the next at once."""
-    monkeypatch.setattr(rollout, "SIDE_BY_SIDE", 3)
-    told: list[tuple[int, int]] = []
-    episodes = rollout.rollout(magnet, ORACLE, EPISODES, 0, lambda *at: told.append(at))
-    free, ends = [0, 0, 0], []
-    for length in episodes.valid.sum(axis=1):
-        ends.append(heapq.heappop(free) + length)
-        heapq.heappush(free, ends[-1])
-    over = [sum(end <= n for end in ends) for n in range(1, max(ends) + 1)]
-    assert told == [(count, EPISODES) for count in over]
 
 
 def test_evaluate_gives_metrics(magnet, monkeypatch):

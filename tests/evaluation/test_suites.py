@@ -12,7 +12,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.agent import actor_critic
 from csac_jax.config import Config, SensorConfig
-from csac_jax.evaluation import policies, rollout, suites
+from csac_jax.evaluation import policies, suites
 from csac_jax.scenes import cases, pool
 from csac_jax.world import scene_state
 
@@ -81,17 +81,6 @@ def test_suite_is_the_same_for_every_policy(suite: str):
     (one,), (other,) = (suites.prepare(cfg, suite, 2, 0).parts.values() for cfg in cfgs)
     jax.tree.map(np.testing.assert_array_equal, one.scenes, other.scenes)
     assert len(np.unique(one.scenes.density)) > 2
-
-
-def test_cases_share_their_compilation():
-    """Claim: all four cases have one config and one physics, so that what is compiled for one
-    serves all."""
-    first, *others = suites.prepare(CFG, "cases", EPISODES, 0).parts.values()
-    assert all(env.cfg == first.cfg and env.physics is first.physics for env in others)
-    begun = rollout._compiled.cache_info().misses
-    for env in (first, *others):
-        rollout._compiled(type(env), env.cfg, env.physics, env.any_yaw, env.max_failures)
-    assert rollout._compiled.cache_info().misses == begun + 1
 
 
 def test_cases_are_turned_as_a_whole():
@@ -217,13 +206,6 @@ def test_camera_suite(monkeypatch: pytest.MonkeyPatch):
             ("oblique", dataclasses.replace(noise, colour=0.2, light=0.2)),
         ]
         assert len({id(env.scenes) for env in parts.values()}) == 1
-
-
-def test_unknown_suite():
-    """Claim: a suite that is none is refused with the names of those that there are."""
-    names = "in_distribution, random10, random30, cases, target, packed, camera"
-    with pytest.raises(ValueError, match=f"'hard'.*{names}"):
-        suites.prepare(CFG, "hard", EPISODES, 0)
 
 
 def test_suite_of_ones_own(monkeypatch: pytest.MonkeyPatch):

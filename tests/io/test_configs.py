@@ -1,9 +1,7 @@
 """Config to JSON and back, and configs in files, against the presets and `Config.change`."""
 
-import dataclasses
 import functools
 import json
-import math
 import re
 import time
 import tomllib
@@ -14,7 +12,7 @@ import pytest
 
 import csac_jax
 from csac_jax import algorithms, presets
-from csac_jax.config import BetaReplay, Config, DenseNet121, LearnConfig, SimConfig
+from csac_jax.config import BetaReplay, Config, DenseNet121
 from csac_jax.errors import SettingsError
 from csac_jax.io import configs, files, renames
 from csac_jax.sweeps import grid, runner
@@ -108,16 +106,6 @@ def test_former_settings_have_their_constants():
             configs.from_dict(number | {"net": stored["net"] | {field: value}})
 
 
-def test_differences_are_named_in_order():
-    """Claim: differences are dotted names, in order of definition; equal configs have none."""
-    a = Config()
-    b = dataclasses.replace(
-        a, seed=1, sim=SimConfig(contacts=5), learn=LearnConfig(batch=16, tau=0.1)
-    )
-    assert configs.differences(a, b) == ["seed", "sim.contacts", "learn.batch", "learn.tau"]
-    assert configs.differences(a, Config()) == []
-
-
 def _nested(depth: int) -> Any:
     return functools.reduce(lambda value, _: [value], range(depth), 0)
 
@@ -127,19 +115,14 @@ def _nested(depth: int) -> Any:
     [
         ("learn", {"bath": 3}, r"learn\.bath: unknown setting"),
         ("learn", {"batch": "3"}, r"learn\.batch: input should be a valid integer"),
-        ("learn", {"batch": 3.0}, r"learn\.batch: input should be a valid integer"),
         ("learn", {"tau": 2.0}, r"learn\.tau: must be at most 1, not 2\.0"),
-        ("learn", 3, "learn: input should be an object"),
         ("scene", {"slots": ["ball"]}, r"scene\.slots\.0: input should be 'box'"),
         ("sim", {"grasp_phases": [1, 2]}, r"sim\.grasp_phases\.2: field required"),
-        ("replay", {"sampler": "best"}, r"replay\.sampler: 'best' is not one of: uniform"),
         ("replay", {"sampler": "uniform", "end": [1, 2]}, r"replay\.end: unknown setting"),
         ("format", 1, "format: 1 is unknown, this version reads 2; use the csac-jax that wrote"),
         ("learn", {"tau": 10**400}, r"learn\.tau: must be at most 1, not inf"),
-        ("learn", {"learning_rate": math.nan}, r"learn\.learning_rate: .*not nan"),
         ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
         ("learn", {"tau": _nested(100_000)}, "learn: is nested too deeply"),
-        ("learn", {f"k{i}": i for i in range(20_000)}, r"learn\.k0: unknown setting"),
         ("net", {"kind": ["small"]}, "net.kind: "),
     ],
 )
@@ -234,18 +217,12 @@ def test_algorithm_comes_before_the_settings(tmp_path: Path):
         (".toml", "[learn]\ntau = 0.1", r'preset: is missing; add one, such as preset = "quick"$'),
         (".toml", 'preset = "quik"', "unknown preset 'quik'; did you mean quick"),
         (".toml", "SMOKE[learn]\nbath = 3", r"learn\.bath: unknown setting$"),
-        (".toml", "SMOKE[lern]\nbatch = 3", "lern: unknown setting$"),
         (".toml", 'SMOKElearn = "fast"', "learn: must be a section of settings, not 'fast'$"),
-        (".toml", "SMOKE[learn]\ntau = 2.0", r"learn\.tau: must be at most 1, not 2\.0$"),
-        (".toml", 'SMOKEalgo = "dqn"', "unknown algorithm 'dqn'; choose one of"),
-        (".toml", "SMOKEformat = 9", "format: 9 is unknown, this version reads"),
         (".toml", "SMOKE[learn\n", r"is no readable TOML \("),
         (".toml", "\udcff", ".*decode"),
         (".ini", "", "the name of a config file ends in .toml, .yaml, .yml, .json"),
-        (".yaml", "- 1", "must hold settings by name"),
         (".yaml", "a: &a [1]\nb: *a", "aliases"),
         (".yaml", "seed: !!python/object/apply:os.getpid []", "is no readable YAML"),
-        (".json", "{", "is no readable JSON"),
         (".json", "[" * 100_000, "is nested too deeply"),
     ],
 )
@@ -262,7 +239,6 @@ def test_fault_names_file_and_key(tmp_path: Path, suffix: str, text: str, messag
     ("suffix", "text", "message"),
     [
         (".yaml", "preset: [" + "[" * 100_000, "has 100001 brackets, more than 1000"),
-        (".yaml", "preset: " + "{" * 100_000, "has 100000 brackets"),
         (".toml", "a." * 50_000 + "a = 1", "has a line of 100005 characters"),
         (".toml", "#\n" * 2**17, "larger than 128 KiB"),
     ],

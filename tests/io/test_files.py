@@ -121,13 +121,6 @@ def test_json_that_is_no_object_is_named(tmp_path: Path):
     assert files.read_object(tmp_path / "a.json") == {"b": 1}
 
 
-def test_the_first_line_of_an_error():
-    """Claim: of a long message the first line is shown, of the system's errors their text."""
-    assert files.first_line(OSError(errno.ENOSPC, "No space left", "a")) == "No space left"
-    assert files.first_line(ValueError("one\ntwo")) == "one"
-    assert files.first_line(KeyError()) == "KeyError"
-
-
 def test_a_folder_is_written_by_one_process(tmp_path: Path):
     """Claim: a second holder is refused with the first one's name; one that another host did not
     release is warned of; after the end nobody holds it."""

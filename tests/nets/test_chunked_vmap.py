@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from csac_jax import presets
 from csac_jax.nets import chunked_vmap
@@ -36,23 +36,3 @@ def test_chunks_do_what_each_does(size: int):
         for i in range(6):
             for name, leaf in part(keys[i], runs[i], shared).items():
                 assert_allclose(got[name][i], leaf, rtol=1e-6, err_msg=name)
-
-
-@pytest.mark.parametrize(("size", "calls"), [(1, 2), (2, 6), (3, 6)])
-def test_branch_stays_one_in_chunks_of_one(size: int, calls: int):
-    """Claim: of six runs, two of which take a costly branch, only these two run it if they come one
-    by one."""
-    ran = []
-
-    def part(costly: jax.Array, x: jax.Array) -> jax.Array:
-        def cost() -> jax.Array:
-            jax.debug.callback(lambda _: ran.append(1), x)
-            return x + 1.0
-
-        return jax.lax.cond(costly, cost, lambda: x)
-
-    taken = jnp.array([0, 1, 0, 0, 1, 0], bool)
-    got = jax.jit(jax.vmap(chunked_vmap.vmap_in_chunks(part, size)))(taken, jnp.arange(6.0))
-    jax.effects_barrier()
-    assert_array_equal(got, [0.0, 2.0, 2.0, 3.0, 5.0, 5.0])
-    assert len(ran) == calls

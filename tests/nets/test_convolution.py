@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from csac_jax.config import DenseNet121, SmallNet
-from csac_jax.nets import networks
 from csac_jax.nets.convolution import conv2d, convolve_by_taps
 
 SETTINGS = [  # rows, columns, kernel, stride, dilation, padding; the first five are the net's
@@ -105,25 +103,3 @@ def test_taps_are_a_convolution(size: int, dilation: int):
         value, back = jax.vjp(plain, maps[run], kernels[run])
         for got, wanted in zip(results, (value, *back(gradients[run])), strict=True):
             assert_allclose(got[run], wanted, atol=1e-4)
-
-
-def test_runs_side_by_side_convolve_by_taps_on_a_gpu(monkeypatch: pytest.MonkeyPatch):
-    """Claim: for several runs under `vmap` the small critic convolves by taps on a GPU, with the
-    same variables and values; on a CPU, the paper's, and of thousands of passes, as ever."""
-    net = SmallNet(stem=8, growth=8, head=8, dilations=(1, 2))
-    plain, paper = networks.make(net), networks.make(DenseNet121())
-    assert plain.side_by_side() is plain
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    taps = plain.side_by_side()
-    assert paper.side_by_side() is paper
-    assert taps.critic.by_taps
-    maps = jax.random.normal(jax.random.key(0), (2, 24, 24, 4))
-    variables = taps.critic.init(jax.random.key(1), maps)
-    many = jax.ShapeDtypeStruct((8192, 64, 64, 4), jnp.float32)
-    cases = ((plain.critic, maps, True), (taps.critic, maps, False), (taps.critic, many, True))
-    for critic, inputs, convolves in cases:
-        text = str(jax.make_jaxpr(critic.apply)(variables, inputs))
-        assert ("conv_general_dilated" in text) is convolves
-    both = (net.critic.apply(variables, maps) for net in (taps, plain))
-    for got, wanted in zip(*both, strict=True):
-        assert_allclose(got, wanted, atol=2e-2)  # bfloat16's

@@ -92,44 +92,6 @@ def test_maps_have_the_size_that_frames_say(kind: str, target: bool, colour: boo
     assert isinstance(critic, densenet.DenseNetCritic if kind == "densenet121" else dense.Critic)
 
 
-@pytest.mark.slow
-def test_states_of_densenet_are_seen_in_groups():
-    """Claim: DenseNet-121 sees one state of 640 px at a time, four of 320, and what it says of each
-    is what it says of its passes by themselves; the small net sees all at once."""
-    assert networks.make(DenseNet121()).states_at_once(320) == 1
-    assert networks.make(with_constants(DenseNet121(), upsample=1)).states_at_once(320) == 4
-    assert networks.make(SmallNet()).states_at_once(72) is None
-    nets = networks.make(with_constants(TINY["densenet121"], upsample=1))
-    apply = jax.jit(nets.critic.apply)
-    net_input = jax.random.normal(jax.random.key(0), (3, 2, 32, 32, 4))
-    variables = jax.jit(nets.critic.init)(jax.random.key(1), net_input[0])
-    for group in (1, 2, 3):
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(networks, "_FULL", 32 * group**0.5)
-            assert nets.states_at_once(32) == group
-            got = jax.jit(lambda: networks.apply(nets, variables, net_input))()
-        apart = [apply(variables, one) for one in net_input]
-        for leaf, *wanted in zip(got, *apart, strict=True):
-            assert_allclose(leaf, np.stack(wanted), rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["small", "densenet121"])
-def test_looks_at_any_number_of_states_share_products(kind: str):
-    """Claim: one state and eight share the shapes of products with DenseNet-121 alone."""
-    nets = networks.make(TINY[kind])
-    variables = jax.eval_shape(nets.critic.init, jax.random.key(0), jnp.zeros((1, 640, 640, 4)))
-
-    def products(states: int) -> set[str]:
-        net_input = jax.ShapeDtypeStruct((states, 2, 640, 640, 4), jnp.float32)
-        look = jax.jit(lambda variables, net_input: networks.apply(nets, variables, net_input))
-        lines = look.lower(variables, net_input).as_text().splitlines()
-        named = ("stablehlo.convolution", "stablehlo.dot_general")
-        return {line.split(" : ")[-1] for line in lines if any(name in line for name in named)}
-
-    assert products(1)
-    assert (products(1) == products(8)) == (kind == "densenet121")
-
-
 def test_mirrored_maps_are_the_mean_of_four_looks():
     """Claim: of a scene in a mirror along or across the frame, the mirrored Q is the mirror of the
     scene's Q, pushes ahead and back swapped along it; and it is the mean of four looks."""

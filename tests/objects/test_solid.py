@@ -8,7 +8,7 @@ import scipy.linalg
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from csac_jax.objects import body, solid
+from csac_jax.objects import solid
 
 CUBE = np.array([*itertools.product((0.0, 1.0), repeat=3)])
 
@@ -64,19 +64,3 @@ def test_planes_hold_the_corners_and_no_more():
     mesh = trimesh.Trimesh(part.vertices, part.triangles)
     np.testing.assert_array_equal(inside, trimesh.proximity.signed_distance(mesh, points) > 0)
     assert 50 < inside.sum() < 3000
-
-
-def test_faces_in_one_plane_are_one():
-    """Claim: a cube has six planes, though twelve triangles; flat points are an error in words."""
-    part = solid.convex(0.03 * CUBE)
-    assert len(part.triangles) == 12
-    assert len(part.planes) == 6
-    with pytest.raises(ValueError, match="lie in one plane"):
-        solid.convex(CUBE * [1, 1, 0])
-
-
-def test_narrowest_side_of_a_box():
-    """Claim: a box turned in space is as narrow as its shortest side."""
-    turn = trimesh.transformations.random_rotation_matrix()[:3, :3]
-    part = solid.convex(CUBE * [0.02, 0.05, 0.09] @ turn.T)
-    assert body.make("box", [part]).narrowest == pytest.approx(0.02, rel=1e-4)

@@ -42,12 +42,3 @@ def test_grasp_is_drawn_where_it_is():
     scale = (right - left) / (pixel[1, 0] - pixel[0, 0])
     assert 1.0 < scale < 1.5  # the image is drawn larger than it is
     assert abs(pixel[0, 0] - 232) < 10
-
-
-def test_push_is_a_path():
-    """Claim: a push's path goes down and 10 cm along its yaw; a grasp's fingers are 11 cm apart."""
-    (path,) = drawn.paths(_decision(csac_jax.Action.push(0.0, 0.0, 0.5 * np.pi)), 0.012)
-    np.testing.assert_allclose(path[:, :2], [[0, 0], [0, 0], [0, 0.1]], atol=1e-6)
-    _, tips, *fingers = drawn.paths(_decision(csac_jax.Action.grasp(0.0, 0.0, 0.0)), 0.012)
-    np.testing.assert_allclose(tips[:, 0], [-0.055, 0.055], atol=1e-6)
-    assert len(fingers) == 2

@@ -74,17 +74,6 @@ def test_height_map_and_grasp_lie_where_they_are():
     assert height == pytest.approx(2.0 * RG2.footprint[1], abs=0.01)
 
 
-def test_push_is_an_arrow_over_its_way():
-    """Claim: a push begins at its place, is as long as it goes, and is widest near its end."""
-    yaw = 0.5 * np.pi
-    fig = panels.figure(CFG, _step(Primitive.PUSH, (-0.1, 0.0, yaw), learned=False), HEIGHT)
-    arrow = _places(fig, "Height map", heatmaps.CHOSEN)
-    ends = arrow[:, 1].min(), arrow[:, 1].max()
-    assert ends == pytest.approx((0.0, CFG.sim.push_length), abs=0.005)
-    begin, end = (np.ptp(arrow[part, 0]) for part in (arrow[:, 1] < 0.04, arrow[:, 1] > 0.06))
-    assert end > 2 * begin
-
-
 def test_learned_policy_shows_its_maps():
     """Claim: Q maps share one scale, invalid cells stand out, candidates are in the height map."""
     fig = panels.figure(CFG, _step(Primitive.GRASP, (0.0, 0.0, 0.0), learned=True), HEIGHT)
@@ -100,28 +89,3 @@ def test_learned_policy_shows_its_maps():
     for primitive, x in ((Primitive.PUSH, 0.15), (Primitive.GRASP, -0.15)):
         places = _places(fig, "Height map", panels.CANDIDATES[primitive])
         np.testing.assert_allclose(places.mean(axis=0), [x, 0.15], atol=0.003)
-
-
-@pytest.mark.parametrize("chosen", list(Primitive))
-def test_action_is_drawn_in_its_own_q_map(chosen: Primitive):
-    """Claim: the Q map of the chosen primitive shows the action, the other does not."""
-    fig = panels.figure(CFG, _step(chosen, (0.0, 0.0, 0.0), learned=True), HEIGHT)
-    shown = [len(_places(fig, f"{kind.name.title()} value", heatmaps.CHOSEN)) for kind in Primitive]
-    assert [count > 0 for count in shown] == [kind == chosen for kind in Primitive]
-
-
-@pytest.mark.parametrize("learned", [True, False])
-@pytest.mark.parametrize("size", [(120, 160), (98, 130), (16, 16)])
-def test_sides_are_even_and_the_scene_is_left_as_it_is(learned: bool, size: tuple[int, int]):
-    """Claim: sides are even; the scene is untouched, the text stands below."""
-    scene = np.full((*size, 3), 7, np.uint8)
-    step = _step(Primitive.PUSH, (0.0, 0.0, 0.0), learned)
-    complete = panels.frame(CFG, step, size[0])
-    bare, told = (complete(scene, text) for text in ("", "grasp: lifted"))
-    assert bare.shape == told.shape
-    assert bare.dtype == np.uint8
-    assert all(side % 2 == 0 for side in told.shape[:2])
-    np.testing.assert_array_equal(told[: size[0], : size[1]], scene)
-    np.testing.assert_array_equal(told[: size[0]], bare[: size[0]])
-    assert (told[size[0] :] < 255).any()
-    assert (bare[size[0] :] == 255).all()

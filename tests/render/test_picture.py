@@ -62,21 +62,24 @@ def test_rays_show_what_stands_where():
 def test_rays_shade_by_the_normal():
     """Claim: a pixel is its geom's colour times a brightness by the normal, or white; a box has a
     brightness for each side that is seen, a round geom many."""
-    shapes = [("box", "0.1 0.1 0.1"), ("sphere", "0.1"), ("ellipsoid", "0.1 0.2 0.05")]
-    shapes += [("cylinder", "0.1 0.2"), ("capsule", "0.1 0.2")]
-    for kind, size in shapes:
-        geom = f'<geom type="{kind}" size="{size}" rgba="0.2 0.4 0.8 1"/>'
-        model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geom}</worldbody></mujoco>")
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
-        drawn = picture.renderer(model, VIEW, None)(data).reshape(-1, 3)
-        seen = drawn[drawn.min(axis=1) < 255]
-        assert 50 < len(seen) < 3000
-        np.testing.assert_allclose(
-            seen / seen[:, 2:], np.tile([0.25, 0.5, 1.0], (len(seen), 1)), atol=0.02
-        )
-        levels = len(np.unique(seen[:, 2]))
-        assert (levels == 2) == (kind == "box")
+    sizes = {"box": "0.1 0.1 0.1", "sphere": "0.1", "ellipsoid": "0.1 0.2 0.05"}
+    sizes |= dict.fromkeys(("cylinder", "capsule"), "0.1 0.2")
+    geoms = "".join(
+        f'<geom type="{kind}" size="{size}" pos="0 {0.5 * i - 1} 0" rgba=".2 .4 {0.4 + i / 10} 1"/>'
+        for i, (kind, size) in enumerate(sizes.items())
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{geoms}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    far = Viewpoint(position=(-2.0, 0.0, 1.6), look_at=(0.0, 0.0, 0.0), size=(192, 64))
+    drawn = picture.renderer(model, far, None)(data).reshape(-1, 3)
+    seen = drawn[drawn.min(axis=1) < 255].astype(float)
+    np.testing.assert_allclose(seen[:, 0] / seen[:, 1], 0.5, atol=0.02)
+    number = np.round(10.0 * (0.4 * seen[:, 2] / seen[:, 1] - 0.4)).astype(int)
+    for i in range(len(sizes)):
+        assert 15 < (number == i).sum() < 1500
+        faces = len(np.unique(seen[number == i, 1]))
+        assert faces <= 3 if i == 0 else faces >= 3  # a box shows no more
 
 
 def test_rays_show_scaled_meshes_whole():

@@ -80,10 +80,8 @@ def assert_fits(cells: np.ndarray, probability: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("a", "b"),
-    [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0), (12.0, 1.0), (0.5, 3.0),
-     (3.0, 3.0), (1.0, 4.0), (0.75, 0.75)],
-)  # fmt: skip
+    ("a", "b"), [(1.0, 1.0), (0.5, 0.5), (1.0, 2.0), (1.0, 12.0), (2.0, 5.0), (12.0, 1.0)]
+)
 @pytest.mark.parametrize("size", [CAPACITY, 400])
 def test_ranks_follow_the_beta_law(a, b, size):
     """Claim: rank / n ~ Beta(a, b), rank 0 the largest value, in a full or partly filled ring."""
@@ -120,15 +118,10 @@ def test_large_rings_follow_the_beta_law(a, b):
 
 
 def test_one_transition_is_drawn():
-    """Claim: the only filled slot of a ring is drawn, also by a law whose draws round to 1; a ring
-    of SORTED slots has an exact order."""
-    size = jnp.int32(1)
+    """Claim: the only filled slot of a ring is drawn, also by a law whose draws round to 1."""
     for capacity in (8, LARGE):
-        slots = beta_slots(jax.random.key(0), jnp.ones(capacity), size, 1.0, 0.01, NUM)
+        slots = beta_slots(jax.random.key(0), jnp.ones(capacity), jnp.int32(1), 1.0, 0.01, NUM)
         assert not np.any(slots)
-    values = jnp.ones(samplers.SORTED)
-    order, _ = jax.eval_shape(samplers._ranked, jax.random.key(0), values, size)
-    assert order.shape == values.shape
 
 
 def test_drawing_has_no_open_loop():
@@ -150,11 +143,13 @@ LAWS = {
 
 @pytest.mark.parametrize(
     ("law", "alpha", "size"),
-    [("normal", 0.0, CAPACITY), ("normal", 0.3, CAPACITY), ("normal", 0.6, CAPACITY),
-     ("normal", 1.0, CAPACITY), ("normal", 0.6, 400), ("twelve decades", 0.2, CAPACITY),
-     ("twelve decades", 0.6, CAPACITY), ("twelve decades", 1.0, CAPACITY),
-     ("one giant", 0.6, CAPACITY), ("one giant", 1.0, 700)],
-)  # fmt: skip
+    [
+        ("normal", 0.0, CAPACITY),
+        ("normal", 0.6, 400),
+        ("twelve decades", 1.0, CAPACITY),
+        ("one giant", 0.6, CAPACITY),
+    ],
+)
 def test_prioritised_draws_follow_the_priorities(law, alpha, size):
     """Claim: P(i) = p_i^alpha / sum p^alpha with p = abs(TD error) + epsilon."""
     own = prioritised(alpha=alpha, per_epsilon=1e-6)
@@ -164,7 +159,7 @@ def test_prioritised_draws_follow_the_priorities(law, alpha, size):
     assert_fits(slots, (np.abs(errors[:size].astype(float)) + 1e-6) ** alpha)
 
 
-@pytest.mark.parametrize("size", [2, 3, 7, 50, 64, 100, 400, 512, 999, 1000])
+@pytest.mark.parametrize("size", [2, 7, 64, 999])
 def test_uniform_slots_are_uniform(size):
     """Claim: the uniform sampler draws each filled slot equally often, no other."""
     slots, _ = drawn(SAMPLERS["uniform"], stored(SAMPLERS["uniform"], jnp.ones(CAPACITY), size))
@@ -173,7 +168,7 @@ def test_uniform_slots_are_uniform(size):
     assert_fits(slots, np.ones(size))
 
 
-@pytest.mark.parametrize("capacity", [2, 7, 8, 9, 64, 65, 1000, 4096])
+@pytest.mark.parametrize("capacity", [2, 9, 64, 1000])
 def test_every_capacity_has_its_pyramid(capacity):
     """Claim: whatever the capacity, P(i) = m_i / sum m, also where many m_i are 0 and the others
     span six decades; without mass, slots are still slots."""
@@ -213,16 +208,6 @@ def test_ranking_by_reward():
     assert_fits(ranks(rewards[:400], np.asarray(slots)), beta_law(1.0, 12.0, 400))
 
 
-@pytest.mark.parametrize("replay", [PrioritisedReplay(), BetaReplay(start=(1.0, 12.0))])
-def test_equal_errors_are_drawn_equally(replay):
-    """Claim: slots of equal errors are drawn alike: none is preferred, by either law."""
-    sampler = samplers.make(replay)
-    state = stored(sampler, jnp.ones(20), 10)
-    draw = jax.vmap(lambda key: sampler.sample(key, state, jnp.float32(0.0), 1).slots)
-    slots = jax.jit(draw)(jax.random.split(jax.random.key(0), 4000))
-    assert_fits(np.asarray(slots).ravel(), np.ones(10))
-
-
 @dataclasses.dataclass
 class Action:
     primitive: jax.Array
@@ -243,7 +228,7 @@ def tried(primitive, reward, errors, size: int, head: int = 0) -> ring.ReplaySta
     return dataclasses.replace(state, items=items, head=jnp.int32(head))
 
 
-@pytest.mark.parametrize("kind", range(4))
+@pytest.mark.parametrize("kind", [0, 3])
 def test_opposites_follow_vpgs_law(kind):
     """Claim: against a transition VPG draws one of the same primitive and the opposite outcome, by
     Beta(1, 2) over the ranks of those that fit, in a ring that is partly filled."""
@@ -295,16 +280,6 @@ def test_without_an_opposite_only_the_new_counts():
         assert_array_equal(weights, [1.0, 1.0, 0.0, 0.0])
 
 
-def test_only_opposite_is_drawn():
-    """Claim: where a single transition has the opposite outcome, that one is drawn, also by a law
-    whose draws round to 1."""
-    state = tried([1, 1, 0, 0, 0], [0.0, 1.0, 0.0, 1.0, 1.0], np.ones(5), 4)
-    for b in (2.0, 0.01):
-        found = samplers.opposite_slots(jax.random.key(0), state, jnp.arange(4), 1.0, b)
-        assert_array_equal(found[0], [1, 0, 3, 2])
-        assert np.all(found[1])
-
-
 def test_nan_is_ranked_first():
     """Claim: values that are NaN are ranked first and never let an unfilled slot in."""
     values = jnp.array([1.0, jnp.nan, 3.0, jnp.nan, 9.0, jnp.nan])
@@ -328,8 +303,8 @@ def test_errors_that_are_not_numbers(sampler):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS.values(), ids=SAMPLERS)
-@pytest.mark.parametrize("size", [0, 1, 2, 7, 8])
-@pytest.mark.parametrize("progress", [0.0, 0.4, 1.0])
+@pytest.mark.parametrize("size", [0, 1, 8])
+@pytest.mark.parametrize("progress", [0.0, 1.0])
 def test_slots_are_always_inside(sampler, size, progress):
     """Claim: slots are filled ones, at any fill; in an empty ring they are at least slots."""
     slots, weights = drawn(sampler, stored(sampler, jnp.ones(8), size), 500, progress)
@@ -341,8 +316,9 @@ def test_slots_are_always_inside(sampler, size, progress):
     assert size == 0 or seldom or np.unique(slots).size == size
 
 
-@pytest.mark.parametrize("progress", [-1.0, 0.0, 0.3, 1.0, 2.0])
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(
+    ("progress", "law"), [(-1.0, "normal"), (0.3, "one giant"), (1.0, "normal")]
+)
 def test_weights_by_formula(progress, law):
     """Claim: w_i = (n P(i))^-beta / max_j w_j, beta from first to second of `is_beta` in a line."""
     sampler = prioritised(is_beta=(0.2, 0.8))
@@ -368,15 +344,12 @@ def test_schedule_by_hand(progress, expected):
 
 
 def test_sampler_follows_the_schedule():
-    """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes on;
-    with start, middle and end the same, the law never changes: VPG's Beta(1, 2)."""
+    """Claim: the share of the worst tenth falls from 20.5 % over 10 % to none as training goes
+    on."""
     sampler = SAMPLERS["beta"]
     for progress, share in ((0.0, 0.205), (0.4, 0.10), (1.0, 0.0)):
         slots, _ = drawn(sampler, stored(sampler, jnp.arange(CAPACITY, 0, -1)), progress=progress)
         assert_allclose(np.mean(slots >= 0.9 * CAPACITY), share, atol=0.012)
-    cfg = BetaReplay(start=(1.0, 2.0), middle=(1.0, 2.0), end=(1.0, 2.0))
-    for progress in np.linspace(-0.5, 1.5, 21):
-        assert_array_equal(samplers.beta_schedule(cfg, jnp.float32(progress)), [1.0, 2.0])
 
 
 class Maps(NamedTuple):
@@ -393,7 +366,7 @@ class Step(NamedTuple):
     terminated: jax.Array
 
 
-@pytest.mark.parametrize(("added", "capacity"), [(2, 50), (30, 50), (50, 50), (83, 50)])
+@pytest.mark.parametrize(("added", "capacity"), [(30, 50), (83, 50)])
 def test_ages_are_truncated_geometric(added: int, capacity: int):
     """Claim: of n stored transitions the one of age k is drawn by q^k, the newest `ratio` times as
     often as one of age n."""
@@ -421,7 +394,7 @@ def _episodes(rng: np.random.Generator, steps: int, scenes: int):
     return played, episode, endings
 
 
-@pytest.mark.parametrize(("steps", "capacity"), [(1, 24), (7, 24), (8, 24), (21, 24), (20, 26)])
+@pytest.mark.parametrize(("steps", "capacity"), [(7, 24), (20, 26)])
 def test_reliability_by_episodes(steps: int, capacity: int):
     """Claim: R is 1 less the share of the episode's errors that follow; of one that goes on, the
     errors up to it over the largest sum of any. Draws follow abs(error)^alpha R^omega."""

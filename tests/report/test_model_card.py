@@ -9,7 +9,7 @@ import yaml
 from csac_jax import cli
 from csac_jax.evaluation import metrics
 from csac_jax.io import configs, files, policy_file, seal
-from csac_jax.report import model_card, results
+from csac_jax.report import results
 from experiments import card
 
 CFG, _ = policy_file.load(policy_file.SHIPPED["shipped"])
@@ -47,20 +47,6 @@ def test_card_has_what_hubs_read(tmp_path: Path):
     assert hashlib.sha256(file.read_bytes()).hexdigest() in body
     assert "`csac-jax train general --algo csac_beta --seed 1" in body
     assert "| cases, hole | mine | 10 | 40.0 %" in body
-
-
-def test_card_has_the_time_of_its_run(tmp_path: Path):
-    """Claim: the card of a run has its wall time and device, those of the same config alone."""
-    config = configs.to_dict(CFG)
-    record = {"wall_seconds": 77.2, "device": "a card", "config": config}
-    files.write_json(tmp_path / files.RECORD, record)
-    _result(tmp_path / "random10.json", "random10", random10=9)
-    (file := tmp_path / "mine.safetensors").write_bytes(b"weights")
-    for changed, row in (({}, "| time | 77 s on a card |"), ({"seed": 9}, None)):
-        found = results.training_record(tmp_path, config | changed)
-        evaluated = model_card.read([tmp_path / "random10.json"])
-        text = model_card.write(file, CFG, evaluated, found).read_text()
-        assert row in text if row else "| time |" not in text
 
 
 def test_shipped_policy_has_its_card():

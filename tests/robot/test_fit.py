@@ -1,6 +1,7 @@
 """The opening of a grasp and its middle, in closed form."""
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -29,10 +30,14 @@ def _height(cfg: HeightmapConfig, *boxes: Box, top: float = 0.05) -> jax.Array:
     return jnp.asarray(height)
 
 
-def _fit(cfg: HeightmapConfig, height: jax.Array, *pose: float, gripper: str = "rg2") -> Fit:
-    place = jnp.array(pose or (0.0, 0.0, 0.0), jnp.float32)
+@functools.cache
+def _compiled(cfg: HeightmapConfig, gripper: str) -> Callable[[jax.Array, jax.Array], Fit]:
     hand = grippers.load(gripper)
-    return fit.fit(cfg, height, place, jnp.float32(TIP), hand, hand.fingers)
+    return jax.jit(lambda height, place: fit.fit(cfg, height, place, TIP, hand, hand.fingers))
+
+
+def _fit(cfg: HeightmapConfig, height: jax.Array, *pose: float, gripper: str = "rg2") -> Fit:
+    return _compiled(cfg, gripper)(height, jnp.array(pose or (0.0, 0.0, 0.0), jnp.float32))
 
 
 def _walls(x: float, clear: float) -> list[Box]:
@@ -108,8 +113,8 @@ def test_one_rule_for_one_and_many(gripper: str):
         return fit.fit(cfg, height, pose, tip, hand, fingers)
 
     found = jax.jit(jax.vmap(one))(*many)
-    alone = [one(*jax.tree.map(lambda leaf, i=i: leaf[i], many)) for i in range(16)]
-    np.testing.assert_allclose(found, np.transpose(alone), atol=1e-6)
+    alone = [one(*jax.tree.map(lambda leaf, i=i: leaf[i], many)) for i in range(4)]
+    np.testing.assert_allclose(np.stack(found)[:, :4], np.transpose(alone), atol=1e-6)
     assert (np.abs(found.shift) <= 0.5 * fingers.opening + cfg.cell).all()
     assert (found.half >= hand.half.closed).all()
     assert (found.half <= 0.5 * fingers.opening + 1e-6).all()

@@ -84,17 +84,6 @@ def test_folder_is_the_users_choice(tmp_path: Path):
     assert _run(tmp_path)["folder"] is None
 
 
-def test_processors_do_not_share(monkeypatch: pytest.MonkeyPatch):
-    """Claim: another processor, or another number of threads, has a folder of its own."""
-    here = cache._folder()
-    monkeypatch.setattr(cache, "_processor", lambda: ("model name: another",))
-    other = cache._folder()
-    monkeypatch.undo()
-    monkeypatch.setenv("PJRT_NPROC", "77")
-    assert len({here, other, cache._folder()}) == 3
-    assert any("flags" in line for line in cache._processor()) or not Path("/proc/cpuinfo").exists()
-
-
 LIMITED = """
 import sys
 import csac_jax

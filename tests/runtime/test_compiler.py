@@ -1,11 +1,7 @@
 """Tracing, and the second library for convolutions: right on all of the small net's, left out where
 it is not to be."""
 
-import contextlib
-import gc
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -61,21 +57,6 @@ def test_library_is_right(setting):
     np.testing.assert_allclose(grouped(*two)[0], wanted[0], rtol=0.0, atol=1e-4)
 
 
-def test_library_takes_all_but_kernel_gradients():
-    """Claim: the library computes values and maps' gradients of dense layers; kernel gradients stay
-    with Eigen."""
-    maps, kernel, gradient = map(jnp.ones, ((20, 12, 12, 40), (3, 3, 40, 24), (20, 12, 12, 24)))
-    conv = lambda m, k: conv2d(m, k, 1, 1, 1)  # noqa: E731
-
-    def taken(function, *arguments) -> bool:
-        lowered = jax.jit(function, compiler_options=compiler.LIBRARY).lower(*arguments)
-        return TAKEN in lowered.compile().as_text()
-
-    assert taken(conv, maps, kernel)
-    assert taken(lambda g, k: jax.vjp(lambda m: conv(m, k), maps)[1](g), gradient, kernel)
-    assert not taken(lambda g, m: jax.vjp(lambda k: conv(m, k), kernel)[1](g), gradient, maps)
-
-
 @pytest.mark.usefixtures("forgotten")
 def test_library_that_is_lacking_or_wrong_is_not_used(monkeypatch: pytest.MonkeyPatch):
     """Claim: where XLA does not know the library, or it is wrong, training is compiled without."""
@@ -112,37 +93,3 @@ def test_an_option_that_the_user_gives_stays(monkeypatch: pytest.MonkeyPatch, ch
     monkeypatch.setenv("XLA_FLAGS", f"--xla_dump_to= --{chosen}=0")
     others = {name: value for name, value in compiler.SOONER.items() if name != chosen}
     assert compiler.options(presets.paper()) == others
-
-
-@pytest.mark.parametrize(
-    ("asked", "known"), [(compiler.VENDOR, True), ({"xla_no_such_option": "1"}, False)]
-)
-def test_products_of_densenet_are_the_vendors_on_a_gpu(
-    monkeypatch: pytest.MonkeyPatch, asked, known: bool
-):
-    """Claim: on a GPU DenseNet-121 is compiled without XLA's own matrix products, if this XLA can
-    be asked to."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    monkeypatch.setattr(compiler, "VENDOR", asked)
-    assert compiler.options(presets.paper()) == (asked if known else None)
-
-
-@pytest.mark.parametrize("was_on", [True, False])
-@pytest.mark.parametrize("fails", [False, True])
-def test_collector_is_off_while_a_program_is_traced(was_on: bool, fails: bool):
-    """Claim: it is off as the function is traced, and as before after that, even on failure."""
-    seen = []
-
-    def function(x):
-        seen.append(gc.isenabled())
-        return 2.0 * x if not fails else x / None
-
-    try:
-        if not was_on:
-            gc.disable()
-        with pytest.raises(TypeError) if fails else contextlib.nullcontext():
-            assert compiler.lower(jax.jit(function), 1.5).compile()(1.5) == 3.0
-        assert gc.isenabled() == was_on
-    finally:
-        gc.enable()
-    assert seen == [False]

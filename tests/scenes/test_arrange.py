@@ -1,7 +1,6 @@
 """Drawn arrangements against C MuJoCo: contacts, distances, and half a second of physics."""
 
 import functools
-import itertools
 from collections import Counter
 from typing import NamedTuple
 
@@ -10,13 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from csac_jax import grippers
-from csac_jax.baselines.oracle import OPENING_ROOM, YAWS
 from csac_jax.config import MESH_KINDS, HeightmapConfig, SceneConfig, SimConfig
 from csac_jax.errors import SceneError
-from csac_jax.grippers import Gripper
 from csac_jax.scenes import arrange, cases, packings
 from csac_jax.world import blocks, model, scene_state
 from csac_jax.world.scene_state import SceneState
@@ -32,7 +27,6 @@ BOXES = SceneConfig(slots=("box",) * 5, min_blocks=4, size_jitter=(0.25, 0.25))
 # The usual square, and the smallest.
 EXTENT = {MANY: HeightmapConfig().extent, BOXES: 2.0 * (arrange.RADIUS + 0.001)}
 FAR = 0.08  # m, distances are measured up to here
-PARALLEL = 0.1  # rad, of a closing direction to the normals of two faces
 STACKED = ("wall", "bridge", "tower")  # families with blocks on top of others
 TOGETHER = 0.012  # m, blocks closer than this make a cluster; loose ones keep 15 mm
 
@@ -131,71 +125,6 @@ def test_every_family_settles(drawn: Drawn):
     out = ~drawn.scenes.in_play
     places = np.broadcast_to(scene_state.parking(out.shape[1]), drawn.scenes.position.shape)
     np.testing.assert_array_equal(drawn.scenes.position[out], places[out])
-
-
-def _open_grasps(position: np.ndarray, yaw: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Tests if an antipodal grasp of each block at each of the oracle's yaws is open [n, YAWS].
-
-    Open: two faces across, no wider than the hand, no other block where fingers go down or close.
-    Args: centres [n, 3] m, yaws [n] rad and half extents [n, 3] m, as the blocks lie. Blocks are
-    their bounding boxes. A closing finger is a grid of points at the height of the grasp.
-    """
-    top = position[:, 2] + half[:, 2]
-    sim, gripper = SimConfig(), grippers.load(SimConfig().gripper)
-    tip = np.maximum(top - sim.grasp_depth, gripper.clearance) + 0.002
-    widest = gripper.opening[1] - OPENING_ROOM
-    is_open, angle = np.zeros((len(half), YAWS), bool), np.arange(YAWS) * np.pi / YAWS
-    for i in range(len(half)):
-        off = (angle - yaw[i] + 0.25 * np.pi) % (0.5 * np.pi) - 0.25 * np.pi
-        across = np.round((angle - yaw[i] - off) / (0.5 * np.pi)).astype(int) % 2  # x or y
-        face = half[i, across]
-        fits = np.flatnonzero((np.abs(off) <= PARALLEL) & (2.0 * face <= widest))
-        fingers = [position[i, :2] + _fingers(gripper, face[j]) @ _turn(angle[j]).T for j in fits]
-        points = np.reshape(fingers, (-1, 120, 2))
-        blocked = np.zeros(len(fits), bool)
-        for k in np.flatnonzero((top > tip[i]) & (np.arange(len(half)) != i)):
-            inside = np.abs((points - position[k, :2]) @ _turn(yaw[k])) < half[k, :2]
-            blocked |= inside.all(axis=2).any(axis=1)
-        is_open[i, fits] = ~blocked
-    return is_open
-
-
-def _fingers(gripper: Gripper, face: float) -> np.ndarray:
-    """Returns points [120, 2] m of fingers that close along x on faces at +-`face` m."""
-    thickness, width = gripper.footprint
-    outside = gripper.half[1] + 0.5 * gripper.finger[0] + thickness
-    along = np.linspace(face + 0.0005, outside, 12)
-    x, y = np.meshgrid([*-along, *along], np.linspace(-1.0, 1.0, 5) * width)
-    return np.stack([x.ravel(), y.ravel()], axis=1)
-
-
-def _turn(angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
-
-
-def _open_share(scenes: SceneState, row: tuple[int, int]) -> float:
-    """Returns the share of open grasps of the blocks of a scene in play at every level."""
-    there = scenes.in_play[row]
-    leaves = (scenes.position, scenes.quaternion, scenes.half_size)
-    position, quaternion, half = (leaf[row][there] for leaf in leaves)
-    turn = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    yaw, on_side = np.arctan2(turn[:, 1, 0], turn[:, 0, 0]), np.abs(turn[:, 2, 2]) < 0.5
-    lying = np.where(on_side[:, None], half[:, [0, 2, 1]], half)
-    grasps = _open_grasps(position, yaw, lying)
-    return grasps[scenes.in_play[:, row[1]].all(axis=0)[there]].mean()
-
-
-def test_each_level_is_harder(drawn: Drawn):
-    """Claim: of the blocks that every level has, fewer antipodal grasps are open at each higher
-    level, over all families; where blocks are of all kinds, in each family."""
-    cells = itertools.product(range(len(LEVELS)), range(KEYS))
-    shares = np.reshape([_open_share(drawn.every, cell) for cell in cells], (len(LEVELS), KEYS))
-    easy, middle, hard = shares.mean(axis=1)
-    assert easy > 1.1 * middle > 1.3 * hard
-    for name in packings.FAMILIES if drawn.cfg is MANY else ():
-        easy, middle, hard = shares[:, drawn.families == name].mean(axis=1)
-        assert easy > 1.03 * middle > 1.06 * hard, name
 
 
 def test_level_packs_more_and_closer(drawn: Drawn):
@@ -301,21 +230,3 @@ def test_settings_that_allow_none_are_an_error():
             packings.available(slots)
     with pytest.raises(ValueError, match=r"heightmap\.extent: .* at least 0\.412 m"):
         arrange.arrange(jax.random.key(0), MANY, 0.4, jnp.float32(0.5))
-
-
-@pytest.mark.slow
-def test_key_decides():
-    """Claim: the same key gives the same scene, alone or in a batch; another key, another scene."""
-    cfg = SceneConfig(slots=("box", "box", "arch"), min_blocks=3)
-    levels = jnp.linspace(0.0, 1.0, 8)
-    *pair, keys = (jax.random.split(jax.random.key(1), 8) for _ in range(3))
-    batch, again = (_many(cfg, 0.448, same, levels) for same in pair)
-    jax.tree.map(np.testing.assert_array_equal, batch, again)
-    single = jax.jit(arrange.arrange, static_argnums=(1, 2))
-    alone = jax.device_get(single(keys[3], cfg, 0.448, levels[3]))
-    row = jax.tree.map(lambda leaf: leaf[3], batch)
-    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-6), alone, row)
-    parked = scene_state.parked(cfg.slots)
-    assert jax.tree.all(jax.tree.map(lambda one, two: one.dtype == two.dtype, alone, parked))
-    for name in ("position", "half_size", "density", "friction", "colour"):
-        assert len({row.tobytes() for row in getattr(batch, name)}) == 8, name

@@ -227,7 +227,7 @@ def c_world() -> model.World:
     return model.build(CONFIG.scene, dataclasses.replace(CONFIG.sim, physics="c"))
 
 
-@pytest.fixture(scope="session", params=["c", "mjx", WARP])
+@pytest.fixture(scope="session", params=["c", pytest.param("mjx", marks=pytest.mark.slow), WARP])
 def cases(request: pytest.FixtureRequest) -> Run:
     """CASES on each engine."""
     jitter = CONFIG.scene.size_jitter

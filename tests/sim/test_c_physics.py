@@ -157,15 +157,3 @@ def test_nothing_to_move(c_world: model.World, pushed: tuple, capfd: pytest.Capt
         _, trace = jax.jit(physics.run)(its, way)
         assert not any(np.any(leaf) for leaf in jax.tree.leaves(trace))
     assert capfd.readouterr() == ("", "")
-
-
-def test_key_tells_worlds_apart(c_world: model.World):
-    """Claim: worlds that are built alike have one key, others another."""
-    sim = conftest.CONFIG.change(sim={"physics": "c"}).sim
-    again = model.build(conftest.CONFIG.scene, sim)
-    arm = conftest.CONFIG.change(sim={"physics": "c", "robot": "ur5"}).sim
-    more = conftest.CONFIG.change(scene={"slots": (*conftest.CONFIG.scene.slots, "box")}).scene
-    key = CPhysics(c_world, sim)._key
-    assert CPhysics(again, sim)._key == key
-    assert CPhysics(c_world, arm)._key != key
-    assert CPhysics(model.build(more, sim), sim)._key != key

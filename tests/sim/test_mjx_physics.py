@@ -24,9 +24,10 @@ def _outcomes(run, trace=None) -> np.ndarray:
     return np.asarray(judge(trace or run.trace, run.plan.surface, run.hand_rise))
 
 
-def test_products_keep_their_precision(world):
+def test_programs_keep_their_precision_and_ask_no_host(world):
     """Claim: no matrix product of physics or planner runs at a GPU's reduced precision; MJX itself
-    asks for HIGH, three passes of the reduced one, in its box collisions."""
+    asks for HIGH, three passes of the reduced one, in its box collisions. Nothing in it calls the
+    host."""
     config = conftest.CONFIG
     scene = jax.tree.map(jnp.asarray, scene_state.parked(config.scene.slots))
     height = jnp.zeros((config.heightmap.size,) * 2)
@@ -40,6 +41,7 @@ def test_products_keep_their_precision(world):
     products = re.findall(r"dot_general\[(.*?)\n *\] ", text, re.DOTALL)
     assert len(products) > 10
     assert all("precision=(Precision.HIGH" in product for product in products)
+    assert not any(word in text for word in ("callback", "infeed", "outfeed", "debug_print"))
 
 
 @pytest.mark.parametrize(
@@ -117,6 +119,7 @@ def test_all_that_follows_from_blocks_is_the_scenes():
     assert expected <= changed
 
 
+@pytest.mark.slow
 def test_grasps_agree_with_c(grasped, grasped_in_c):
     """Claim: a grasp has the same outcome in C MuJoCo in at least 95 of 100 scenes, and blocks move
     as far: to 1 mm in the median scene, 5 mm on average."""

@@ -10,11 +10,9 @@ import pytest
 from csac_jax.baselines import oracle
 from csac_jax.config import Config
 from csac_jax.env import Env
-from csac_jax.objects import library, shapes
 from csac_jax.robot import primitives
 from csac_jax.scenes import pool
 from csac_jax.sim import c_physics, physics
-from csac_jax.sim.c_physics import CPhysics
 from csac_jax.world import model
 from csac_jax.world.scene_state import SceneState
 from tests.sim.conftest import TWO_OBJECTS, bar, grasped_bar, thrown_objects
@@ -142,15 +140,3 @@ def test_more_iterations_change_nothing():
         run = jax.jit(jax.vmap(physics.make(world, cfg.sim).run))
         ends.append(run(*thrown_objects(cfg))[0].position)
     np.testing.assert_allclose(*ends, atol=1e-6)
-
-
-def test_heavier_objects_are_another_physics(tmp_path: Path):
-    """Claim: programs kept on disk tell libraries of the same shapes and other densities apart."""
-    light = shapes.draw(3, 2)
-    keys = []
-    for name, density in (("light", 600.0), ("heavy", 1200.0)):
-        made = [dataclasses.replace(one, density=density) for one in light]
-        library.save(tmp_path / name, made)
-        cfg = CONFIG.change(scene={"objects": str(tmp_path / name), "split": "all"})
-        keys.append(CPhysics(model.build(cfg.scene, cfg.sim), cfg.sim)._key)
-    assert keys[0] != keys[1]

@@ -14,15 +14,12 @@ from csac_jax import grippers
 from csac_jax.assets import assets
 from csac_jax.config import HeightmapConfig, SimConfig
 from csac_jax.constants import Primitive
-from csac_jax.robot import kinematics, mjcf, primitives
+from csac_jax.robot import mjcf, primitives
 from csac_jax.robot.primitives import Action
-from csac_jax.sim import mjx_step
-from csac_jax.sim.quiet_mjx import mjx
 
 SIM, MAP = SimConfig(robot="ur5"), HeightmapConfig()
 RG2 = grippers.load("rg2")
 CUBE = 0.025  # m, half its side
-JOINTS = 6
 FINGER = 7  # address in qpos of the first finger, after the six joints and the tool's drive
 BLOCK = 9  # address in qpos of the block
 
@@ -131,27 +128,3 @@ def test_gripper_ends_at_the_flange():
     assert not model.geom_contype[arm].any()
     assert not model.geom_conaffinity[arm].any()
     assert (model.body_gravcomp[model.jnt_bodyid] == 1.0).all()
-
-
-@pytest.mark.mjx
-@pytest.mark.slow
-def test_arm_follows_the_plan_in_mjx():
-    """Claim: so it is in MJX as each phase of a push ends."""
-    model = _model()
-    device, blank = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-
-    @jax.jit
-    def run(qpos, commands):
-        def substep(data, command):
-            data = mjx_step.step(device, data.replace(ctrl=command))
-            return data, data.qpos[:JOINTS]
-
-        return jax.lax.scan(substep, blank.replace(qpos=qpos), commands)[1]
-
-    ends = np.cumsum(SIM.push_phases)
-    for place in ((-0.224, -0.224, 0.0, 0.0), (0.224, 0.0, 3.0, 0.1)):
-        control, target = _plan(Primitive.PUSH, *place)
-        joints = run(jnp.asarray(_start(model, target).qpos, jnp.float32), jnp.asarray(target[1:]))
-        forward = jax.vmap(functools.partial(kinematics.forward, kinematics.arm(SIM)))
-        tips = forward(joints[ends - 1]).position
-        assert np.linalg.norm(tips - control[ends, :3], axis=1).max() < 0.003, place

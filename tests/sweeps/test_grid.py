@@ -75,13 +75,6 @@ def test_switches_are_changes_of_the_preset():
         _points(["switch=ur"])
 
 
-def test_long_names_give_way_to_numbers():
-    """Claim: a folder's name stays short, however much is varied."""
-    names = ("start", "middle", "end")
-    found = _points([f"replay.{name}=1.234567890123:2.345678901234,1:2" for name in names])
-    assert [point.name for point in found] == [f"setting-{i}" for i in range(8)]
-
-
 @pytest.mark.parametrize(
     ("varied", "message"),
     [

@@ -1,7 +1,6 @@
 """Replicas in one program, with a small step in place of the learner's."""
 
 import dataclasses
-import threading
 from typing import Any
 
 import jax
@@ -11,7 +10,7 @@ import pytest
 from csac_jax import algorithms, presets
 from csac_jax.sweeps import replicas
 from csac_jax.sweeps.replicas import SweepProgram
-from csac_jax.training import programs, sharding, step
+from csac_jax.training import programs, step
 from tests.training import toys
 
 pytestmark = pytest.mark.optax
@@ -133,46 +132,6 @@ def test_parts_are_the_same_runs(differ: bool):
         assert_close(metrics, one, 1e-5)
     assert_close(state, wanted, 1e-5)
     assert all(leaf.is_deleted() for leaf in jax.tree.leaves(begun))
-
-
-def test_parts_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch):
-    """Claim: while the host is at work for one part, another goes on: both meet in their callbacks,
-    or neither ends."""
-    meeting = threading.Barrier(2)
-
-    def meet(value: np.ndarray) -> np.ndarray:
-        meeting.wait(timeout=20)
-        return np.asarray(value)
-
-    def train_step(program: step.Program, state: step.TrainState) -> Any:
-        state, metrics = toys.train_step(program, state)
-        here = jax.ShapeDtypeStruct((), np.float32)
-        met = jax.pure_callback(meet, here, state.scenes[0], vmap_method="broadcast_all")
-        return state.replace(scenes=state.scenes.at[0].set(met)), metrics
-
-    monkeypatch.setattr(step, "train_step", train_step)
-    program = _program(_seeds(2), parts=2)
-    state = program.init()
-    chunk = program.compile_chunk(2).lower(state).compile()
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    state, _ = chunk(state)
-    assert int(state.step) == 2
-
-
-def test_number_of_parts(monkeypatch: pytest.MonkeyPatch):
-    """Claim: on a CPU a part for each; on a GPU two where host and device take turns. One where
-    states do not fit twice, for networks that fill a device, and on several devices."""
-    small, large = presets.paper_small(), presets.paper()
-    mjx = presets.smoke().change(sim={"physics": "mjx"})
-    state = sum(replicas.memory.state_bytes(small).values())
-    monkeypatch.setattr(replicas.memory, "limit", lambda: 8 * state)
-    assert [replicas.num_parts(small, runs) for runs in (1, 3, 4, 5)] == [1, 3, 4, 1]
-    assert [replicas.num_parts(cfg, 2) for cfg in (mjx, large)] == [2, 1]
-    mesh = sharding.Mesh(np.array(jax.devices()), (sharding.AXIS,))
-    assert replicas.num_parts(small, 4, mesh) == 1
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert [replicas.num_parts(small, runs) for runs in (1, 2, 3, 4, 6)] == [1, 2, 1, 2, 1]
-    assert replicas.num_parts(large, 2) == replicas.num_parts(mjx, 2) == 1
 
 
 def test_settings_that_are_numbers_share_a_program():

@@ -4,7 +4,6 @@ import functools
 import json
 import math
 import re
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -123,23 +122,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_dir
 
 
-def test_state_is_made_during_the_compilation(tmp_path: Path):
-    """Claim: the first state is made while the chunk is compiled, not before."""
-    compiling, waited, listener, fake = threading.Event(), [], Listener(), Fake()
-
-    def init() -> State:
-        if threading.current_thread() is not threading.main_thread():
-            waited.append(compiling.wait(20.0))
-        return _init()
-
-    def compile_chunk(num_steps: int) -> Any:
-        compiling.set()
-        return fake.compile_chunk(num_steps)
-
-    loop.run(CFG, tmp_path / "run", init, compile_chunk, listener, listener.stop)
-    assert waited == [True]
-
-
 def test_run_ends_complete(tmp_path: Path):
     """Claim: a run takes its actions, compiles once, logs a line per chunk, and saves its end. The
     time left is not said of the first chunk, which may have waited."""
@@ -234,7 +216,6 @@ def test_warnings_come_once(tmp_path: Path):
         ("warp", Fake(), warp, "Warp builds its kernels", 1),
         ("mjx", Fake(), mjx, "Warp builds its kernels", 0),
         ("slow", Fake(), mjx, "MJX compiles for minutes on a CPU", 1),
-        ("c", Fake(), CFG.change(sim={"physics": "c"}), "MJX compiles for minutes", 0),
     )
     for name, fake, cfg, text, times in cases:
         listener = Listener()

@@ -1,7 +1,6 @@
 """Memory of a run: exact bytes of its state, and what is refused."""
 
 import re
-from concurrent.futures import Future
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,7 @@ import pytest
 from csac_jax import presets
 from csac_jax.errors import SettingsError
 from csac_jax.replay import ring
-from csac_jax.training import memory, programs, split_step
+from csac_jax.training import memory, programs
 
 SMOKE = presets.smoke()
 
@@ -52,15 +51,3 @@ def test_presets_fit(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(memory, "limit", lambda: 16 * 10**9)
     for name in presets.PRESETS:
         memory.check(presets.get(name))
-
-
-def test_compiled_program_states_its_memory():
-    """Claim: the line about a compiled program has the bytes that XLA reserved for it."""
-    rows = jax.ShapeDtypeStruct((3 * 2**20, 64), jnp.float32)
-    compiled = jax.jit(lambda x: jnp.sort(x, 0)[0]).lower(rows).compile()
-    temporary = compiled.memory_analysis().temp_size_in_bytes / memory.GIB
-    assert temporary > 0.1
-    text = f"0.75 GiB for states and {temporary:.2f} GiB besides"
-    assert text in memory.compiled_text(compiled)
-    chunk = split_step.Chunk(SMOKE, 1, compiled, Future())
-    assert "0.75 GiB for states; learning still compiles" in memory.compiled_text(chunk)

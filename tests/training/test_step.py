@@ -2,10 +2,7 @@
 
 import dataclasses
 import functools
-import threading
 from collections.abc import Callable
-from concurrent.futures import Future
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -25,7 +22,7 @@ from csac_jax.io import checkpoint
 from csac_jax.replay import ring, samplers
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import physics as simulation
-from csac_jax.training import programs, split_step, step, trace_cache, transitions
+from csac_jax.training import programs, split_step, step, transitions
 from csac_jax.training.step import Program, TrainState
 from csac_jax.training.transitions import StepMetrics
 from csac_jax.vision.heightmap import Observation
@@ -109,16 +106,6 @@ def equal(first: Any, other: Any) -> bool:
     return all(np.array_equal(a, b) for (_, a), (_, b) in pairs)
 
 
-@pytest.mark.slow
-def test_state_is_a_fixed_point_of_types(run):
-    """Claim: a step changes no shape, dtype or weak type of the state, so that its output fits its
-    program."""
-    kind = lambda aval: (aval.shape, aval.dtype, aval.weak_type)  # noqa: E731
-    num = len(jax.tree.leaves(run.states[0]))
-    before, after = run.traced.jaxpr.in_avals, run.traced.jaxpr.out_avals[:num]
-    assert [*map(kind, before)] == [*map(kind, after)]
-
-
 def test_chunks_after_the_first_compile_nothing(run):
     """Claim: one program serves every chunk; nothing is compiled while it runs on."""
     assert run.compilations == 0
@@ -140,59 +127,6 @@ def test_two_programs_do_what_one_does(run: Run):
             np.testing.assert_allclose(b, a, rtol=1e-4, atol=1e-5, err_msg=name)
     assert metrics.learned.all()
     assert not run.metrics[0].learned.all()
-
-
-def test_acting_does_not_wait_for_what_learns():
-    """Claim: each step acts, then learns once updates begin. Until then a chunk needs the program
-    that acts alone; from there on it waits for the other one, and fails as that does."""
-    cfg = CFG.change(train={"scenes": 4, "learning_starts": 12})  # the third step learns
-
-    def act(state: Any) -> tuple[Any, dict[str, Any]]:
-        calls = [*state.calls, "act"]
-        return SimpleNamespace(step=state.step + 1, calls=calls), {"learned": False}
-
-    def learn(state: Any, metrics: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        return SimpleNamespace(step=state.step, calls=[*state.calls, "learn"]), {"learned": True}
-
-    failed, later = Future[Any](), Future[Any]()
-    failed.set_exception(MemoryError("no room"))
-    later.set_result(learn)
-    chunk = split_step.Chunk(cfg, 2, act, failed)
-    state, metrics = chunk(SimpleNamespace(step=0, calls=[]))
-    np.testing.assert_array_equal(metrics["learned"], [False, False])
-    with pytest.raises(MemoryError, match="no room"):
-        chunk(state)
-    state, metrics = chunk._replace(learn=later)(state)
-    assert state.calls == ["act", "act", "act", "learn", "act", "learn"]
-    np.testing.assert_array_equal(metrics["learned"], [True, True])
-
-
-def test_what_acts_is_there_first(monkeypatch: pytest.MonkeyPatch):
-    """Claim: a chunk is compiled as soon as it can act, by the thread that asks, so that it sees
-    whether the cache had it; what learns compiles after that."""
-    go_on = threading.Event()
-    half = SimpleNamespace(lower=lambda: SimpleNamespace(compile=lambda: go_on.wait(60.0)))
-    monkeypatch.setattr(trace_cache, "jit", lambda *_: half)
-    act = SimpleNamespace(out_info=(), compile=threading.current_thread)
-    chunk = split_step._Split(mock.Mock(), T, False, act).compile()
-    assert (chunk.act, chunk.learn.done()) == (threading.main_thread(), False)
-    go_on.set()
-    assert chunk.learn.result(60.0)
-
-
-def test_chunks_of_accelerators_are_one_program(monkeypatch: pytest.MonkeyPatch, run: Run):
-    """Claim: only on a CPU, on one device and without overlap, is a chunk two
-    programs."""
-
-    def is_split(program: Program) -> bool:
-        return isinstance(split_step.compile_chunk(program, T), split_step._Split)
-
-    assert is_split(run.program)
-    assert not is_split(dataclasses.replace(run.program, mesh=mock.Mock()))
-    overlapped = CFG.change(train={"overlap": True})
-    assert not is_split(dataclasses.replace(run.program, cfg=overlapped))
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert not is_split(run.program)
 
 
 class Pusher(Learner):

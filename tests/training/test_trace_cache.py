@@ -1,7 +1,6 @@
 """Traced programs that are cached on disk."""
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -148,14 +147,3 @@ def test_own_parts_are_not_cached(program: Program, monkeypatch: pytest.MonkeyPa
             assert hasattr(trace_cache.jit(program, step.act_half, True), "folder") == cached
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
-
-
-def test_oldest_program_goes_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    """Claim: no more than `MOST` are kept; one that was just read stays."""
-    monkeypatch.setattr(trace_cache, "MOST", 2)
-    for age, name in enumerate("ab"):
-        trace_cache._write(tmp_path / name, name.encode())
-        os.utime(tmp_path / name, (age, age))
-    assert trace_cache._read(tmp_path / "a") == b"a"
-    trace_cache._write(tmp_path / "c", b"c")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "c"]

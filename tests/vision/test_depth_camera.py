@@ -83,14 +83,6 @@ def test_errors_are_those_of_the_data_sheets(kind: str, distance: float, error: 
         assert correlation == pytest.approx(alike, abs=0.05)
 
 
-def test_disparities_have_steps():
-    """Claim: depths of the D435 belong to whole thirty-seconds of a pixel of disparity."""
-    depth, valid = _plane(4.0, kind="d435")
-    disparity = 32.0 * 424.0 * 0.050 / depth[valid]
-    assert len(np.unique(depth[valid])) > 4
-    assert np.abs(disparity - np.round(disparity)).max() < 0.1  # depths are rounded to 1 mm
-
-
 @pytest.mark.parametrize(
     ("distance", "lightness", "kind", "share"),
     [

@@ -84,11 +84,3 @@ def test_camera_at_the_side_agrees_with_mujoco(world: model.World):
         ).distance
         apart = np.abs(np.asarray(depths(scene)).ravel() - distance) > 1e-4
         assert apart.mean() < 1e-4, seed
-
-
-def test_windows_are_smaller_than_the_view():
-    """Claim: rays meet an object in a window of the image only."""
-    radius = object_slots.table(CONFIG.scene).radius
-    rows, columns = camera.window(CONFIG.camera, CONFIG.heightmap.extent, observe.HIGHEST, radius)
-    assert rows * columns < 0.5 * CONFIG.camera.size[0] * CONFIG.camera.size[1]
-    assert camera.window(CONFIG.camera, 0.448, 0.25, 10.0) == CONFIG.camera.size[::-1]

@@ -5,11 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
-from csac_jax import geometry
 from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.vision import camera, heightmap, observe, raycast
 from csac_jax.vision.heightmap import Observation
-from tests.vision.conftest import cubes
 
 CFG = HeightmapConfig(64, view="oblique")
 _EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
@@ -95,17 +93,3 @@ def test_both_views_agree_where_the_camera_sees(reference):
     assert np.median(off) < 1e-4
     assert np.all(beside.height[~filled] == 0.0)
     assert np.all(beside.target)
-
-
-def test_a_block_casts_a_shadow():
-    """Claim: of a cube the top is seen, and nothing behind it as far as the sight line says."""
-    cube = cubes((0.0, 0.0, 0.025))
-    _, obs = _views(cube, _FINE)
-    height, filled = np.asarray(obs.height), np.asarray(obs.colour).sum(-1) > 0.0
-    x = np.asarray(geometry.cell_centres(CFG))[0, :, 0]
-    middle = slice(30, 34)  # rows at y = 0
-    end = 0.025 + 0.525 * 0.05 / 0.45  # where the line over the far top edge meets the table
-    np.testing.assert_allclose(height[middle][:, np.abs(x) < 0.02], 0.05, atol=1e-4)
-    assert not filled[middle][:, (x > 0.03) & (x < end - 0.008)].any()
-    assert filled[middle][:, x > end + 0.008].mean() > 0.95
-    assert filled[middle][:, x < -0.03].mean() > 0.95

@@ -146,11 +146,3 @@ def test_a_broken_scene_spoils_no_other():
     gone = polytopes.replace(offset=polytopes.offset.at[1].set(-1.0))
     seen = (_cast(scene, origin, direction) for scene in (broken, gone))
     jax.tree.map(np.testing.assert_array_equal, *seen)
-
-
-def test_no_array_over_rays_geoms_and_faces():
-    """Claim: casting R rays at G geoms of F faces needs less memory than one array [R, G, F]."""
-    polytopes = _random_scene(np.random.default_rng(5), geoms=10, faces=10)
-    rays = jnp.ones((4096, 3), jnp.float32)
-    memory = _cast_all.lower(polytopes, rays, rays).compile().memory_analysis()
-    assert memory.temp_size_in_bytes < 4096 * 10 * 10 * 4

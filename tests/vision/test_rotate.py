@@ -63,17 +63,6 @@ def test_quarter_turns_are_exact():
         np.testing.assert_array_equal(inner, np.rot90(maps, quarter))
 
 
-def test_one_frame_is_that_of_all():
-    """Claim: `rotate` with k gives frame k of all, for a traced k, under vmap over maps and k."""
-    tables = rotate.tables(64, 0.448, _K, _K, 80)
-    maps = jnp.asarray(np.random.default_rng(0).normal(size=(5, 64, 64, 4)), jnp.float32)
-    k = jnp.array([0, 3, 15, 8, 7], jnp.int32)
-    every = jax.vmap(lambda m: rotate.rotate(tables, m))(maps)
-    one = jax.jit(jax.vmap(lambda m, i: rotate.rotate(tables, m, i)))(maps, k)
-    np.testing.assert_array_equal(one, np.asarray(every)[np.arange(5), np.asarray(k)])
-    assert rotate.rotate(tables, jnp.ones((64, 64, 2), jnp.uint16)).dtype == jnp.uint16
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, _K - 1), st.floats(-0.15, 0.15), st.floats(-0.15, 0.15))
 @example(2, 0.11138523104556389, 0.11138523104556389)
@@ -111,17 +100,3 @@ def test_bilinear_agrees_with_scipy():
     for i in range(3):
         expected = scipy.ndimage.map_coordinates(values[i], row_col[i].T, order=1, mode="nearest")
         np.testing.assert_allclose(read[i], expected, atol=1e-5)
-
-
-def test_a_small_margin_loses_corners():
-    """Claim: a canvas of sqrt(2) times the map shows corners in every frame, one of 9/8 does not in
-    frame 2."""
-    corners = np.zeros((64, 64, 1), np.float32)
-    corners[[0, 0, -1, -1], [0, -1, 0, -1]] = 1.0
-    corners[[1, 1, -2, -2], [1, -2, 1, -2]] = 1.0
-    for canvas, kept in ((90, True), (72, False)):
-        tables = rotate.tables(64, 0.448, _K, _K, canvas)
-        frames = np.asarray(rotate.rotate(tables, jnp.asarray(corners)))
-        turned = [np.rot90(frames[2, :, :, 0], turn) for turn in range(4)]
-        quarters = np.stack(turned)[:, : tables.canvas // 4]
-        assert np.all(quarters.sum((1, 2)) >= 1.0) == kept

@@ -141,23 +141,6 @@ def test_views_differ_from_step_to_step(view, errors):
     assert 0.0 < np.mean(off) < 0.01
 
 
-@pytest.mark.slow
-def test_orthographic_errors():
-    """Claim: from above, heights err as depths do from VIEW_HEIGHT, and a dropped cell is empty."""
-    env = _env(sensor=dataclasses.replace(ERRORS, depth_noise=(0.001, 0.01)))
-    scene = env._sample_scene(jax.random.key(0))
-    noisy = jax.jit(jax.vmap(lambda key: observe.observe(env.cfg, scene, key)))
-    views, true = noisy(jax.random.split(jax.random.key(3), 500)), _look(env, scene)
-    height, empty = np.asarray(views.height), np.asarray(views.colour).sum(-1) == 0.0
-    assert abs(empty.mean() - 0.1) < 0.005
-    assert np.all(height[empty] == 0.0)
-    raised = np.asarray(true.height) > 0.04
-    assert raised.sum() > 10
-    errors = (height - np.asarray(true.height))[:, raised][~empty[:, raised]]
-    depth = heightmap.VIEW_HEIGHT - 0.05
-    np.testing.assert_allclose(errors.std(), 0.001 + 0.01 * depth**2, rtol=0.1)
-
-
 @pytest.mark.mjx
 @pytest.mark.parametrize("view", [SMALL, pytest.param(OBLIQUE, marks=pytest.mark.slow)])
 def test_colours_are_dropped_for_whole_episodes(view):
@@ -216,16 +199,6 @@ def test_without_errors_there_is_no_randomness():
     assert "random" in str(jax.make_jaxpr(noisy.reset_to)(scene, jax.random.key(0)))
     with pytest.raises(ValueError, match=r"sensor.*key"):
         noisy.reset_to(scene)
-
-
-def test_the_config_chooses_the_view():
-    """Claim: the view is from above by default, by the config's camera if oblique."""
-    env = _env(heightmap=OBLIQUE)
-    scene = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), env.scenes)
-    above, beside = (_look(each, scene) for each in (_env(), env))
-    hidden = np.asarray(beside.colour).sum(-1) == 0.0
-    assert 0.01 < hidden.mean() < 0.9
-    assert np.asarray(above.colour).sum(-1).min() > 0.0
 
 
 @pytest.mark.parametrize(

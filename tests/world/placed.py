@@ -41,13 +41,6 @@ def case_in_c(case: cases.Case) -> tuple[model.World, mujoco.MjModel, mujoco.MjD
     return world, *in_c(world, case.scene)
 
 
-def model_bytes(exact: mujoco.MjModel) -> bytes:
-    """Returns all of a model."""
-    content = np.zeros(mujoco.mj_sizeModel(exact), np.uint8)
-    mujoco.mj_saveModel(exact, None, content)
-    return content.tobytes()
-
-
 def corners(exact: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
     """Returns corners [V, 3] m of a geom in the world."""
     if exact.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:

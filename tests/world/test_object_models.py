@@ -15,7 +15,6 @@ from csac_jax.objects import body, library, shapes, solid
 from csac_jax.scenes import pool
 from csac_jax.world import model, object_slots
 from csac_jax.world.scene_state import SceneState
-from tests.world import placed
 
 SLOTS = [0, 2, 4]  # of objects
 HEAVY = 1500.0  # kg/m^3, of all but the first object
@@ -112,17 +111,6 @@ def test_swapped_objects_fall_as_compiled_ones(cfg: Config, world: model.World):
         np.testing.assert_allclose(path, fall(own, world, scene), rtol=0, atol=1e-9)
         touching += (path[-1, :, 2] < 0.15).sum()
     assert touching >= 14  # they have met the table and one another
-
-
-def test_a_swap_leaves_nothing_behind(cfg: Config, world: model.World):
-    """Claim: a model that held other objects before is the same, byte by byte, as a fresh one."""
-    one, two = (jax.device_get(model.scene_fields(world, dropped(cfg, seed))) for seed in (5, 6))
-    fresh = model.with_blocks(world, two)
-    used = model.with_blocks(world, one)
-    used.geom_contype[:] = world.model.geom_contype  # as `c_physics` does before
-    used.geom_conaffinity[:] = world.model.geom_conaffinity
-    again = model.with_blocks(world, two, into=(used, mujoco.MjData(used)))
-    assert placed.model_bytes(again) == placed.model_bytes(fresh)
 
 
 def test_blocks_beside_objects_are_as_without(cfg: Config, world: model.World):

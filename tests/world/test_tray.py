@@ -179,13 +179,3 @@ def test_a_tray_that_does_not_fit_is_one_line(change: dict, line: str):
     with pytest.raises(ValueError, match=line) as caught:
         Config().change(**change)
     assert "\n" not in str(caught.value)
-
-
-def test_pools_without_tray_keep_their_names():
-    """Claim: the digest of a pool names the tray only where there is one: shipped pools, which are
-    older, are still found."""
-    plain = presets.quick()
-    digest = pool._digest(plain, pool.TRAIN_STREAM, plain.scene.pool)
-    assert (pool.shipped() / f"{digest}.npz").is_file()
-    walled = plain.change(scene={"tray": 0.3})
-    assert pool._digest(walled, pool.TRAIN_STREAM, plain.scene.pool) != digest
