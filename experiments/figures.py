@@ -19,7 +19,7 @@ from csac_jax.report import comparison, figures, results
 from csac_jax.report.comparison import ResultReport
 from csac_jax.report.figures import Chart
 from csac_jax.report.results import Results
-from experiments import index, summary
+from experiments import index, second_tables, summary
 
 plt.rcParams["axes.prop_cycle"] = cycler(color=figures.PALETTE)
 
@@ -55,6 +55,7 @@ def draw() -> Iterator[tuple[str, Figure]]:
     """Draws all figures and yields them by name."""
     yield "suites", suites()
     yield "replay", replay()
+    yield "study-pushes", pushes()
     yield from sweeps()
     for chart in figures.draw(comparison.build(results.read([RESULTS]))):
         yield chart.name, _with_paper(chart)
@@ -136,6 +137,31 @@ def suites() -> Figure:
     for place, text in zip(middles, ("need pushes", "need grasps"), strict=True):
         panel.text(104, place, text, rotation=270, ha="center", va="center")
     figure.legend(loc="outside lower center", ncols=3, fontsize="small")
+    return figure
+
+
+def pushes() -> Figure:
+    """Draws what pushes add to completion in each row of H1 and H2 of the second study."""
+    named, bands = second_tables.hypotheses(), {}
+    for rows in (named["H1"], named["H2"]):
+        found = second_tables.judge(index.STUDY, rows)
+        for row in rows:
+            name = row.name if row.suite in row.name else f"{row.suite}, {row.name}"
+            bands[name] = found[row.name].band
+    value, low, high = (
+        100 * np.array([getattr(band, end) for band in bands.values()])
+        for end in ("value", "low", "high")
+    )
+    figure, panel = plt.subplots(figsize=(8, 2.8), layout="constrained")
+    margin, places = 100 * second_tables.MARGIN, range(len(bands), 0, -1)
+    panel.axvspan(-margin, margin, color="lightgrey", zorder=0, label="within the margin")
+    panel.axvline(0, color="black", linewidth=0.6)
+    ends, colour = (value - low, high - value), figures.PALETTE[2]
+    panel.errorbar(value, places, xerr=ends, fmt="D", capsize=3, color=colour)
+    panel.axhline(len(named["H2"]) + 0.5, color="black", linewidth=0.6)
+    panel.set_yticks(places, bands)
+    panel.set_xlabel("completion with pushes less that without, points")
+    panel.legend(loc="lower right", fontsize="small")
     return figure
 
 
