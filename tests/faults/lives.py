@@ -443,9 +443,10 @@ def corrupt(life: Life) -> None:
     step = checkpoint.latest_step(run.path) or 0
     folder = run.path / checkpoint.FOLDER / str(step)
     paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stat().st_size]
-    if life.rng.random() < 0.2:
+    log = run.path / files.METRICS
+    if life.rng.random() < 0.2 and log.stat().st_size:
         run.log_whole = False
-        paths = [run.path / files.METRICS]
+        paths = [log]
     # Arrays lie in files with random names.
     path = life.pick(sorted(paths, key=lambda path: (path.parent, path.stat().st_size, path.name)))
     harness.damage(life.rng, kind, path)
