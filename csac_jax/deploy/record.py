@@ -80,10 +80,8 @@ class Entry(NamedTuple):
     @property
     def image(self) -> Image:
         """Reads the arguments of `CameraPolicy.decide`."""
-        names, mask = (
-            ("rgb.png", "depth.npy", "intrinsics.json", "pose.json"),
-            self.path / "mask.png",
-        )
+        names = "rgb.png", "depth.npy", "intrinsics.json", "pose.json"
+        mask = self.path / "mask.png"
         image = image_files.read_image(*(self.path / name for name in names))
         return (*image, image_files.read_mask(mask) if mask.exists() else None)
 

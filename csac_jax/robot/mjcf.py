@@ -54,18 +54,18 @@ def pads(gripper: Gripper) -> tuple[str, str]:
 def hand_geoms(spec: mujoco.MjSpec, gripper: Gripper) -> tuple[list[str], list[str], list[str]]:
     """Returns the names in the model of the palm, of the low finger's geoms and of the high one's.
 
-    A finger is all below the hand's root that moves with its pad, which comes first.
+    A finger is its pad, which comes first, and the rest of the largest subtree without the other.
     """
-    low, high = (_finger(spec, pad, PREFIX + gripper.body) for pad in pads(gripper))
-    return [PREFIX + gripper.palm], low, high
+    low, high = pads(gripper)
+    return [PREFIX + gripper.palm], _finger(spec, low, high), _finger(spec, high, low)
 
 
-def _finger(spec: mujoco.MjSpec, pad: str, root: str) -> list[str]:
-    body = spec.geom(pad).parent
-    while body.parent.name != root:
-        body = body.parent
-    names = [geom.name for geom in body.find_all("geom") if geom.contype or geom.conaffinity]
-    return sorted(names, key=lambda name: name != pad)
+def _finger(spec: mujoco.MjSpec, pad: str, other: str) -> list[str]:
+    found, body = [pad], spec.geom(pad).parent
+    while other not in (below := [geom.name for geom in body.find_all("geom")]):
+        found, body = below, body.parent
+    touch = [name for name in found if spec.geom(name).contype or spec.geom(name).conaffinity]
+    return [pad, *(name for name in touch if name != pad)]
 
 
 def joint_names(sim: SimConfig, gripper: Gripper) -> list[str]:

@@ -16,7 +16,7 @@ from csac_jax.config import Config, PhysicsKind, SceneConfig, SimConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Grip
-from csac_jax.robot import primitives
+from csac_jax.robot import mjcf, primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import c_physics, outcome, physics as simulation
 from csac_jax.vision import observe
@@ -149,6 +149,27 @@ def test_fingers_are_all_that_moves_with_a_pad(gripper: str):
         assert sorted(world.hand_geoms[world.hand_parts == part]) == found.tolist()
         assert world.hand_geoms[world.hand_parts == part][0] == world.pads[part - 1]
     assert (world.hand_parts == 0).sum() == 1
+
+
+def test_a_jaw_may_be_fixed_and_fingers_may_hang_lower():
+    """Claim: a pad on the root itself is its own finger; fingers below one common body are two."""
+    geom = '<geom name="{}" size="0.01" pos="{} 0 0"/>'
+    finger = '<body name="{0}"><joint type="slide"/>{1}{2}</body>'.format
+    high = finger("right", geom.format("high", 1), geom.format("knuckle", 2))
+    low = finger("left", geom.format("low", -1), geom.format("nail", -2))
+    palm, found = geom.format("palm", 0), []
+    for below in (geom.format("low", -1) + high, f'<body name="base">{low}{high}</body>'):
+        hand = mujoco.MjSpec.from_string(
+            f'<mujoco><worldbody><body name="root">{palm}{below}</body></worldbody></mujoco>'
+        )
+        spec = mujoco.MjSpec()
+        spec.attach(hand, prefix=mjcf.PREFIX, frame=spec.worldbody.add_frame())
+        own = dataclasses.replace(grippers.load("rg2"), palm="palm", pads=("low", "high"))
+        parts = mjcf.hand_geoms(spec, own)
+        found.append([[name.removeprefix(mjcf.PREFIX) for name in part] for part in parts])
+    fixed, hanging = found
+    assert fixed == [["palm"], ["low"], ["high", "knuckle"]]
+    assert hanging == [["palm"], ["low", "nail"], ["high", "knuckle"]]
 
 
 @pytest.mark.slow
