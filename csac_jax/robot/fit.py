@@ -14,6 +14,7 @@ from csac_jax.config import HeightmapConfig
 from csac_jax.grippers import Fingers, Gripper
 
 ROOM = 0.01  # m (ours), between what is grasped and each open finger
+LESS_ROOM = 0.006, 0.003  # m (ours), where a finger would come down on something else
 
 
 class Fit(NamedTuple):
@@ -30,8 +31,9 @@ def fit(
 
     What is higher than the tips at the middle is grasped, over gaps of a cell; where the middle is
     bare, all that is between the open tips. The hand moves to its middle and opens ROOM wider on
-    both sides, at most fully. Where nothing or what is wider than the hand lies, or where only the
-    fully open fingers come down on free ground, it opens fully in place.
+    both sides, at most fully. Where a finger would then come down on something else, it opens the
+    first of LESS_ROOM wider that is free. Where nothing or what is wider than the hand lies, or
+    where only the fully open fingers come down on free ground, it opens fully in place.
     """
     most, step = 0.5 * jnp.asarray(fingers.opening, jnp.float32), 0.5 * cfg.cell
     count = int(np.ceil((gripper.opening[1] + gripper.finger[0]) / step))
@@ -52,7 +54,8 @@ def fit(
 
     back, ahead = end(-1.0), end(1.0)
     shift, half = 0.5 * (ahead - back), 0.5 * (ahead + back)
-    opened = jnp.clip(half + ROOM, gripper.half[0], most)
+    rooms = [jnp.clip(half + room, gripper.half[0], most) for room in (ROOM, *LESS_ROOM)]
+    opened = jnp.select([~blocked(shift, room) for room in rooms], rooms, rooms[0])
     fits = jnp.any(between) & (half < most) & (~blocked(shift, opened) | blocked(0.0, most))
     return Fit(jnp.where(fits, shift, 0.0), jnp.where(fits, opened, most))
 

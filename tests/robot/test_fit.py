@@ -73,16 +73,27 @@ def test_cube_in_the_middle_counts(cfg: HeightmapConfig):
     assert _fit(cfg, bridged).shift == pytest.approx(0.5 * (0.028 + cfg.cell), abs=0.5 * cfg.cell)
 
 
-@pytest.mark.parametrize("cfg", MAPS)
-def test_fingers_come_down_on_free_ground(cfg: HeightmapConfig):
+def test_fingers_come_down_on_free_ground():
     """Claim: beside a neighbour on which a finger would come down, the hand opens fully in place
     and encloses both; if those fingers would come down on another, it fits all the same."""
-    cube, near, far = (0.007, 0.0, 0.028, 0.1), (0.042, 0.0, 0.014, 0.1), (0.063, 0.0, 0.014, 0.1)
+    cfg = MAPS[1]
+    cube, near, far = (0.007, 0.0, 0.028, 0.1), (0.04, 0.0, 0.014, 0.1), (0.063, 0.0, 0.014, 0.1)
     np.testing.assert_allclose(_fit(cfg, _height(cfg, cube, near)), [0.0, OPEN], rtol=1e-6)
     wanted = 0.007, 0.014 + fit.ROOM
     np.testing.assert_allclose(
         _fit(cfg, _height(cfg, cube, near, far)), wanted, atol=0.5 * cfg.cell
     )
+
+
+@pytest.mark.parametrize(
+    ("clear", "room"), [(0.026, 0.01), (0.02, 0.006), (0.016, 0.003), (0.012, 0.01)]
+)
+def test_hand_opens_less_where_it_is_narrow(clear: float, room: float):
+    """Claim: beside walls `clear` m from a cube the hand opens the widest of ROOM and LESS_ROOM
+    that leaves its fingers of 12 mm free; where none does, ROOM."""
+    cfg = MAPS[1]
+    half = _fit(cfg, _height(cfg, (0.0, 0.0, 0.028, 0.028), *_walls(0.0, 0.014 + clear))).half
+    assert half == pytest.approx(0.014 + room, abs=0.2 * cfg.cell)
 
 
 @pytest.mark.parametrize("gripper", ["rg2", "2f85", "franka_hand"])
