@@ -1,5 +1,6 @@
 """Episodes in which a deployed policy sees images of MuJoCo's renderer and moves a robot."""
 
+import argparse
 import collections
 import functools
 import itertools
@@ -12,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from csac_jax.config import Config, RobotKind, SensorConfig, SimConfig
+from csac_jax.config import Config, SensorConfig, SimConfig
 from csac_jax.constants import OUTCOMES
 from csac_jax.deploy import CameraPolicy
 from csac_jax.deploy.decision import Decision
+from csac_jax.deploy.record import PUSHED, Recorder, ReportedOutcome
 from csac_jax.env import Env
 from csac_jax.errors import DataWarning, ViewError
 from csac_jax.evaluation import suites
@@ -43,21 +45,19 @@ class Loop(NamedTuple):
     env: Env
     episodes: int
     seed: int
+    recorder: Recorder | None  # of images, decisions and outcomes
 
 
-def make(source: str, robot: RobotKind, episodes: int, seed: int) -> Loop:
-    """Makes the loop of the policy `source`, see `Policy.load`, in random10."""
-    policy = CameraPolicy.load(source)
-    world = suites.standard(policy.cfg, "random10")
+def make(options: argparse.Namespace) -> Loop:
+    """Makes the loop of a policy, see `CameraPolicy.load`, in a suite of one part."""
+    policy = CameraPolicy.load(options.policy, gripper=options.gripper)
+    world = suites.standard(policy.cfg, options.suite)
     clear = world.change(sensor=SensorConfig(), heightmap={"view": "oblique"})
-    cfg = clear.change(sim={"physics": "c", "robot": robot})
-    (env,) = suites.prepare(cfg, "random10", episodes, seed).parts.values()
-    return Loop(policy, env, episodes, seed)
-
-
-def sensors(kind: Any) -> dict[str, SensorConfig]:
-    """Returns the sensors that images are taken with, by name."""
-    return {"clean": SensorConfig(), "noise": SensorConfig(kind=kind)}
+    cfg = clear.change(sim={"physics": "c", "robot": options.robot})
+    scenes = options.episodes, options.seed
+    (env,) = suites.prepare(cfg, options.suite, *scenes, objects=options.objects).parts.values()
+    recorder = options.record and Recorder(options.record, options.policy)
+    return Loop(policy, env, *scenes, recorder)
 
 
 class Step(NamedTuple):
@@ -142,13 +142,19 @@ def _episode(
         key = jax.random.fold_in(episode_key, action)
         image = _photograph(env.cfg, errors, key, studio, scene)
         begun = time.perf_counter()
-        decision = _decide(loop.policy, env.cfg, image, counts)
+        decisions = _decide(loop.policy, env.cfg, image, counts)
         seconds.append(time.perf_counter() - begun)
-        moved = False
-        if decision is not None:
-            scene, moved = _move(env, scene, decision, counts)
+        moved, reported = False, None
+        if decisions:
+            scene, moved, reported = _move(env, scene, decisions[0], counts)
         unchanged = 0 if moved else unchanged + 1
-        if not scene.in_play.any() or unchanged >= task.max_steps_without_change:
+        ended = not scene.in_play.any() or unchanged >= task.max_steps_without_change
+        ended |= action + 1 == task.max_actions
+        if loop.recorder and reported:
+            seen = (*image, intrinsics(env.cfg.camera), _pose(env.cfg), None)
+            entry = loop.recorder.add(seen, decisions)
+            loop.recorder.post(entry, ReportedOutcome(outcome=reported, ended=bool(ended)))
+        if ended:
             break
     studio.close()
     counts["table_empty"] += not scene.in_play.any()
@@ -187,32 +193,32 @@ _sensed = jax.jit(sensor.image, static_argnums=(1, 2))
 
 def _decide(
     policy: CameraPolicy, cfg: Config, image: Any, counts: collections.Counter[str]
-) -> Decision | None:
-    """Returns the best action; None where the image is refused or shows nothing to act on."""
+) -> list[Decision]:
+    """Returns the best action, or none where the image is refused or shows nothing to act on."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DataWarning)
         try:
             decisions = policy.decide(*image, intrinsics(cfg.camera), _pose(cfg))
         except ViewError:
             counts["refused"] += 1
-            return None
+            return []
     counts["warnings"] += len(caught)
     counts["nothing_to_act_on"] += not decisions
-    return decisions[0] if decisions else None
+    return decisions
 
 
 def _move(
     env: Env, scene: SceneState, decision: Decision, counts: collections.Counter[str]
-) -> tuple[SceneState, bool]:
-    """Moves the robot; returns the scene, and True if it has changed."""
+) -> tuple[SceneState, bool, str | None]:
+    """Moves the robot; returns the scene, True if it has changed, and the outcome of a motion."""
     is_grasp = decision.primitive == "grasp"
     step = jax.device_get(act(env, scene, set_points(env.cfg.sim, decision), jnp.bool(is_grasp)))
     counts["grasps" if is_grasp else "pushes"] += 1
     if not step.reachable:
         counts["out_of_reach"] += 1
-        return scene, False
-    if is_grasp:
-        counts[OUTCOMES[int(step.outcome)]] += 1
+        return scene, False, None
+    reported = OUTCOMES[int(step.outcome)] if is_grasp else PUSHED
+    counts[reported] += is_grasp
     counts["blocks_taken"] += int(step.lifted.sum())
     counts["blocks_lost"] += int(step.blocks_lost)
-    return step.scene, bool(step.moved)
+    return step.scene, bool(step.moved), reported

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from csac_jax.constants import Primitive
-from csac_jax.deploy import decision
+from csac_jax.deploy import decision, record
 from csac_jax.deploy.decision import Choice, stations
 from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
@@ -74,18 +74,23 @@ def test_waypoints_are_followed_as_planned(primitive: Primitive):
 
 
 @pytest.mark.slow
-def test_closed_loop():
-    """Claim: the benchmark counts grasps, lifts and refusals, clean and with noise, as JSON."""
-    flags = ["--episodes", "1", "--robot", "hand"]
+def test_closed_loop(tmp_path: Path):
+    """Claim: the benchmark counts grasps, lifts and refusals, clean and with noise, as JSON, and
+    its record has every action with its outcome."""
+    flags = ["--episodes", "1", "--robot", "hand", "--record", str(tmp_path / "record")]
     command = [sys.executable, "-m", "csac_jax", "bench", "closed_loop", *flags]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
     if "OpenGL" in done.stderr:
         pytest.skip("OpenGL works neither by EGL nor by OSMesa")
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    for name, kind in (("clean", "none"), ("noise", "d415")):
-        part = found[name]
-        assert part["sensor"] == kind
-        assert part["counts"]["blocks"] == 10
-        assert part["grasp_success"]["n"] == part["counts"]["grasps"] >= 8
-        assert part["counts"]["lifted"] >= 6
+    counts = [found[kind]["counts"] for kind in ("none", "d415")]
+    for part, count in zip((found["none"], found["d415"]), counts, strict=True):
+        assert count["blocks"] == 10
+        assert part["grasp_success"]["n"] == count["grasps"] >= 8
+        assert count["lifted"] >= 6
+    entries = record.read(tmp_path / "record")
+    reported = [entry.outcome for entry in entries if entry.outcome]
+    assert len(entries) == len(reported) == sum(one["grasps"] + one["pushes"] for one in counts)
+    assert sum(one.outcome == "lifted" for one in reported) == sum(one["lifted"] for one in counts)
+    assert sum(one.ended for one in reported) == 2
