@@ -275,7 +275,8 @@ def match_networks(cfg: Config, source: str | Path) -> Config:
     net = stored.net
     if isinstance(net, SmallNet) and isinstance(cfg.net, SmallNet):
         mask = net.mask or (stored.sees_mask and not cfg.task.has_target)
-        net = dataclasses.replace(net, gripper=net.gripper or cfg.net.gripper, mask=mask)
+        more = {name: getattr(net, name) or getattr(cfg.net, name) for name in ("gripper", "fit")}
+        net = dataclasses.replace(net, mask=mask, **more)
     return cfg.change(net=net, learn=learn, heightmap={"size": stored.heightmap.size})
 
 

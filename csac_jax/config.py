@@ -246,6 +246,7 @@ class SmallNet(_AnyNet):
     canvas_step: ClassVar[int] = 4  # whole cells at either stride
     kind: Literal["small"] = "small"  # `densenet121` is the paper's: 100 times the work.
     gripper: bool = False  # See the gripper's opening and the size of its fingers.
+    fit: bool = False  # See how the hand would fit at each cell, see `robot.fit.everywhere`.
     mask: bool = False  # See the mask of what is wanted also where all is, as in the task clear.
     growth: int = number(24, 4, 1024)  # Channels that each dense layer adds.
     dilations: tuple[int, ...] = number((1, 2, 4, 1), 1, 64)  # Dilation of each dense layer, 3 x 3.
@@ -264,6 +265,7 @@ class DenseNet121(_AnyNet):
     block_layers: ClassVar[tuple[int, int, int, int]] = (6, 12, 24, 16)  # arXiv:1608.06993, table 1
     block_growth: ClassVar[int] = 32  # channels that each dense layer adds (the same)
     gripper: ClassVar[bool] = False  # no trunk sees the gripper
+    fit: ClassVar[bool] = False
     mask: ClassVar[bool] = False  # a trunk sees the target's where the task has one
     STRIDE: ClassVar[int] = 32  # pixels of the input per cell of the features, along each axis
     upsample: ClassVar[int] = 2  # pixels of the input per cell of the map, along each axis (VPG)

@@ -80,8 +80,7 @@ def q_of_actions(
     lower = rotate.floor(index)
     k = jnp.mod(lower[:, None].astype(jnp.int32) + np.array([[0, 1]], np.int32), num)  # [B, 2]
     half = jnp.mod(k, num // 2)
-    inputs = maps.input_maps(frames, obs)
-    passes = jax.vmap(rotate.rotate, (None, 0, 0))(frames.tables, inputs, half)
+    passes = jax.vmap(maps.rotated_inputs, (None, 0, 0))(frames, obs, half)
     flat, net = passes.reshape(-1, *passes.shape[2:]), frames.networks.critic
     (q, _), statistics = values.map_critics(lambda own: networks.train(net, own, flat), critic)
     q = q.reshape(q.shape[0], *k.shape, *q.shape[2:])  # [M, B, 2, h, w, OUTPUTS]

@@ -18,13 +18,16 @@ from csac_jax import geometry, grippers
 from csac_jax.agent import box
 from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
+from csac_jax.grippers import Fingers
 from csac_jax.nets import dense
 from csac_jax.nets.networks import Networks
-from csac_jax.robot import primitives
+from csac_jax.robot import fit, primitives
 from csac_jax.sim.outcome import BARE
 from csac_jax.vision import heightmap, rotate
 from csac_jax.vision.heightmap import Observation
 from csac_jax.world import tray
+
+FIT_SCALE = 100.0  # 1 / m, of the maps of `fit.everywhere` in the net's input
 
 
 def allowed_primitives(cfg: PolicyConfig) -> tuple[Primitive, ...]:
@@ -37,6 +40,8 @@ class Frames:
     """Geometry of the dense maps' cells. K = yaws, h = w = rows and columns of a map."""
 
     tables: rotate.RotationTables  # of the first K / 2 frames; the others are these upside down
+    sim: SimConfig  # of a net that sees how the hand fits
+    sees_fit: bool
     yaws: np.ndarray  # [K] rad
     networks: Networks
     side: int  # h = w, cells
@@ -60,6 +65,8 @@ def frames(cfg: Config, networks: Networks) -> Frames:
     xy, yaws = _cells(rotations, side, cell)
     return Frames(
         tables=tables,
+        sim=sim,
+        sees_fit=cfg.net.fit,
         yaws=yaws,
         networks=networks,
         side=side,
@@ -146,9 +153,20 @@ def input_maps(frames: Frames, obs: Observation) -> jax.Array:
     return frames.networks.inputs(obs.colour, obs.height, target, obs.fingers)
 
 
-def rotated_inputs(frames: Frames, obs: Observation) -> jax.Array:
-    """Rotates the net's input to the first K / 2 frames, [K / 2, C, C, I]."""
-    return rotate.rotate(frames.tables, input_maps(frames, obs))
+def rotated_inputs(frames: Frames, obs: Observation, k: Any = slice(None)) -> jax.Array:
+    """Rotates the net's input to frames `k` [F] of the first K / 2, by default all: [F, C, C, I].
+
+    A net that sees how the hand fits gets the maps of `fit.everywhere`, in units of 10 mm.
+    """
+    rotated = rotate.rotate(frames.tables, input_maps(frames, obs), k)
+    if not frames.sees_fit:
+        return rotated
+    gripper = grippers.load(frames.sim.gripper)
+    fingers = gripper.fingers if obs.fingers is None else Fingers(*obs.fingers)
+    heights = rotate.rotate(frames.tables, obs.height[..., None], k)[..., 0]
+    least = primitives.grasp_depth(frames.sim, gripper), primitives.lowest(frames.sim, gripper)
+    found = fit.everywhere(frames.tables.cell, heights, *least, gripper, fingers)
+    return jnp.concatenate([rotated, FIT_SCALE * found], axis=-1)
 
 
 def unfold(halves: jax.Array) -> jax.Array:

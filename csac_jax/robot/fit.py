@@ -3,8 +3,10 @@
 S = samples along the closing, half a cell apart; the middle of the hand lies between two of them.
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -78,3 +80,53 @@ def _highest(
     col, row = jnp.moveaxis(jnp.clip(cells, 0, cfg.size - 1), -1, 0)
     seen = jnp.asarray(height).at[row, col].get(mode="promise_in_bounds")
     return jnp.max(jnp.where(inside, seen, 0.0), axis=1)
+
+
+def everywhere(
+    cell: float, heights: Array, depth: float, lowest: float, gripper: Gripper, fingers: Fingers
+) -> Array:
+    """Sees how the hand would fit at each cell of maps that are closed along their columns.
+
+    Args: cell, its side, m; heights [F, C, C] m; depth, m, of the tips below the surface, and
+    lowest, m, their least height. Returns [F, C, C, 4] m: half the width of what lies between the
+    fingers, the way to its middle, the height of its lower side above the tips, and how far what
+    lies beside it stands above them, where a finger would come down. All are 0 where nothing is,
+    and the same for mirror images. A gap of a cell is none.
+    """
+    num, steps = heights.shape[1], int(np.ceil(0.5 * gripper.opening[1] / cell))
+    beside = int(np.ceil((gripper.finger[0] + LESS_ROOM[-1]) / cell)) + 1
+    lines, margin = int(np.ceil(0.5 * gripper.finger[1] / cell)), steps + beside
+    needed = jnp.asarray(fingers.thickness, jnp.float32) + LESS_ROOM[-1]
+
+    def moved(maps: Array, way: int, axis: int) -> Array:  # what lies `way` cells on; 0 outside
+        padded = jnp.pad(maps, [(0, 0), *((margin * (axis == one),) * 2 for one in (1, 2))])
+        return jax.lax.slice_in_dim(padded, margin + way, margin + way + num, axis=axis)
+
+    def highest(maps: Array, axis: int) -> Array:  # under the width of a finger
+        ways = range(-lines, lines + 1)
+        under = [jnp.asarray(2.0 * abs(way) * cell <= fingers.width) | (way == 0) for way in ways]
+        rows = [moved(maps, way, axis) for way in ways]
+        return functools.reduce(jnp.maximum, map(jnp.where, under, rows, [0.0] * len(rows)))
+
+    across = highest(heights, 1)
+    tip = jnp.maximum(highest(across, 2) - depth, lowest)
+    there = across > tip
+
+    def side(way: int) -> tuple[Array, Array, Array]:
+        on, reach, edge, landing = there, 0.0 * tip, across - tip, 0.0 * tip
+        above = [moved(across, way * step, 2) - tip for step in range(margin + 1)]
+        for step in range(1, margin + 1):
+            solid = above[step] > 0.0
+            if step <= steps:
+                on &= solid | (above[step + 1] > 0.0)
+                reach = jnp.where(on & solid, step * cell, reach)
+                edge = jnp.where(on & solid, above[step], edge)
+            lands = ~on & ((step - 1) * cell - reach < needed)
+            landing = jnp.where(lands, jnp.maximum(landing, above[step]), landing)
+        return reach, edge, landing
+
+    (back, *one), (ahead, *other) = side(-1), side(1)
+    width, middle = 0.5 * (ahead + back + cell), 0.5 * jnp.abs(ahead - back)
+    edge, landing = jnp.minimum(one[0], other[0]), jnp.maximum(one[1], other[1])
+    found = jnp.stack([width, middle, edge, landing], axis=-1)
+    return jnp.where(there[..., None], found, 0.0)

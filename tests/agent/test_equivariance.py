@@ -19,10 +19,10 @@ from tests.sections import with_constants
 K = 12  # no yaw of 45 degrees, where the nearest cell of a diagonal is a matter of rounding
 QUARTER = K // 4
 SIZE = 96
+SMALL: Any = {"rotations": K, "growth": 8, "dilations": (1, 2), "stem": 8, "head": 8}
 NETS = {
-    "small": with_constants(
-        SmallNet(rotations=K, growth=8, dilations=(1, 2), stem=8, head=8), pad_fraction=0.5
-    ),
+    "small": with_constants(SmallNet(**SMALL), pad_fraction=0.5),
+    "fit": with_constants(SmallNet(**SMALL, fit=True), pad_fraction=0.5),
     "densenet121": with_constants(
         DenseNet121(rotations=K, head=8),
         pad_fraction=0.5,
@@ -126,6 +126,8 @@ def test_one_yaw_step(net, seed):
     """Claim: of a smooth scene turned by one yaw step, 30 degrees here, maps change by a twentieth
     of their spread at most, those of DenseNet by a quarter, for cells are the nearest ones; and the
     turned best action is worth the best one within as much."""
+    if net.learner.cfg.net.fit:
+        pytest.skip("what a hand fits about ends at an edge: those maps are not smooth")
     first = np.array(_kept(1))
     before, after = (net.look(net.params, _hills(seed, yaw)) for yaw in (0.0, 2.0 * np.pi / K))
     change = np.asarray(after.q[:, :, first + 1] - before.q[:, :, first])

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from csac_jax import grippers
 from csac_jax.agent import maps, policy
 from csac_jax.constants import Primitive
+from csac_jax.geometry import cell_centres
 from csac_jax.nets import dense, networks
 from csac_jax.robot import primitives
 from csac_jax.sim.outcome import BARE
@@ -174,6 +176,26 @@ def test_target_task_grasps_the_target_alone(frames, block):
     assert_array_equal(valid[PUSH], maps.actionable_cells(frames, amid)[PUSH])
     assert 0 < np.asarray(valid[GRASP]).sum() < frames.inside.sum() // 4
     assert np.all(valid[PUSH] == frames.inside)
+
+
+def test_net_sees_how_the_hand_fits(cfg):
+    """Claim: with `net.fit` four maps follow those without it; above the middle of a disc they
+    have half its width, no shift, its height below the surface, and nothing beside, at all yaws."""
+    plain, fitted = (cfg.change(net={"fit": flag}, heightmap={"size": 224}) for flag in (0, 1))
+    away = jnp.linalg.norm(cell_centres(fitted.heightmap), axis=-1)
+    height = jnp.where(away < 0.03, 0.05, 0.0)
+    bare = jnp.full((*height.shape, 3), 0.5)
+    obs = Observation(bare, height, jnp.ones(height.shape, bool))
+    frames = [maps.frames(one, networks.make(one.net)) for one in (plain, fitted)]
+    before, after = (np.asarray(maps.rotated_inputs(one, obs)) for one in frames)
+    assert_array_equal(after[..., :-4], before)
+    middle = after.shape[1] // 2
+    found = after[:, middle, middle, -4:] / maps.FIT_SCALE
+    depth = primitives.grasp_depth(cfg.sim, grippers.load(cfg.sim.gripper))
+    assert_allclose(found, [[0.03, 0.0, depth, 0.0]] * len(found), atol=0.004)
+    assert not after[:, 0, 0, -4:].any()
+    some = maps.rotated_inputs(frames[1], obs, jnp.array([2, 0]))
+    assert_array_equal(some, after[np.array([2, 0])])
 
 
 def test_normalise_is_inverse(frames):

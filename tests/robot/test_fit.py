@@ -131,6 +131,31 @@ def test_one_rule_for_one_and_many(gripper: str):
     assert (found.half <= 0.5 * fingers.opening + 1e-6).all()
 
 
+@pytest.mark.parametrize("gripper", ["rg2", "franka_hand"])
+def test_maps_agree_with_each_grasp(gripper: str):
+    """Claim: the maps of all cells have the width and the middle that a grasp at each cell finds,
+    and heights beside it as of the boxes drawn."""
+    cfg, hand = HeightmapConfig(size=112), grippers.load(gripper)
+    boxes = [(-0.102, 0.1, 0.028, 0.04), (0.08, -0.1, 0.04, 0.1), (0.132, -0.1, 0.04, 0.1)]
+    height = _height(cfg, *boxes)
+    seen = jax.jit(lambda height: fit.everywhere(cfg.cell, height, 0.03, TIP, hand, hand.fingers))
+    half, shift, side, landing = np.moveaxis(np.asarray(seen(height[None])[0]), -1, 0)
+    for x, y, length, _ in boxes:
+        row, col = (int(at // cfg.cell) + cfg.size // 2 for at in (y, x))
+        at = cfg.cell * (np.array([col, row]) + 0.5 - 0.5 * cfg.size)
+        found = _fit(cfg, height, *at, 0.0, gripper=gripper)
+        assert half[row, col] == pytest.approx(0.5 * length, abs=0.5 * cfg.cell)
+        assert shift[row, col] == pytest.approx(abs(x - at[0]), abs=0.5 * cfg.cell)
+        assert side[row, col] == pytest.approx(0.05 - 0.02, abs=1e-6)  # 30 mm below the top
+        close = abs(y + 0.1) < 0.01  # two of them stand 12 mm from one another
+        assert landing[row, col] == pytest.approx(0.03 if close else 0.0, abs=1e-6)
+        if not close:
+            assert found.half == pytest.approx(half[row, col] + fit.ROOM, abs=0.5 * cfg.cell)
+    assert not half[:16].any()  # bare table
+    turned = seen(height[None, ::-1, ::-1])[0, ::-1, ::-1]
+    np.testing.assert_array_equal(turned, np.stack([half, shift, side, landing], axis=-1))
+
+
 @pytest.mark.parametrize("opening", ["full", "fit"])
 def test_plan_follows_the_setting(opening: str):
     """Claim: with `fit` a grasp comes down about the cube; with `full` as decided, fully open. A
