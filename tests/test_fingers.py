@@ -206,12 +206,14 @@ def test_net_sees_the_fingers(states: State):
 
 
 def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
-    """Claim: networks without the last inputs, gripper and target, are a start: Q is the same for
-    all fingers, and the nets still see the gripper. Those that lack another input are refused."""
+    """Claim: networks without the last inputs, gripper, target and how the hand fits, are a start:
+    Q is the same for all fingers, and the nets still see the gripper. Those that lack another input
+    are refused."""
     blind = presets.smoke().change(sim={"physics": "c"})
     params, path = _networks(blind), tmp_path / "policy.safetensors"
     policy_file.save(path, params, blind)
-    for cfg in (CONFIG, CONFIG.change(task={"kind": "target"})):
+    changes: Any = {"task": {"kind": "target"}}, {"net": {"fit": True}}
+    for cfg in (CONFIG, *(CONFIG.change(**one) for one in changes)):
         start: Any = api.initial_networks(cfg, path)
         learner = actor_critic.make(cfg)
         fresh = jax.jit(lambda key, learner=learner: actor_critic.init(key, learner))
@@ -225,7 +227,9 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
             )
         )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
-    assert api.match_networks(CONFIG, "shipped_clutter").net.gripper
+    found = api.match_networks(CONFIG.change(net={"fit": True}), "shipped_clutter").net
+    assert found.gripper
+    assert found.fit
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)
         policy_file.save(path, _networks(other), other)
