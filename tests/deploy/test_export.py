@@ -132,6 +132,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "gripper": {"net": {"gripper": True}, "task": {"kind": "target"}, "sim": {"gripper": "2f85"}},
     "heights": {"net": {"colour": False, "stride": 4, "subpixel": 2, "dilations": (1, 2)}},
     "mirrored": {"policy": {"augment": True}, "learn": {"critics": 2}, "net": {"subpixel": 2}},
+    "fit": {"net": {"fit": True, "gripper": True}, "sim": {"gripper": "2f85"}},
     "anywhere": {"policy": {"action_mask": "none", "height_bonus": 3.0}},
     "grasp": {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}},
 }
