@@ -89,14 +89,14 @@ def everywhere(
 
     Args: cell, its side, m; heights [F, C, C] m; depth, m, of the tips below the surface, and
     lowest, m, their least height. Returns [F, C, C, 4] m: half the width of what lies between the
-    fingers, the way to its middle, the height of its lower side above the tips, and how far what
-    lies beside it stands above them, where a finger would come down. All are 0 where nothing is,
-    and the same for mirror images. A gap of a cell is none.
+    fingers, the way to its middle, the height of its lower side above the tips, and how far what a
+    finger would come down on stands above them. All are 0 where nothing is, and the same for mirror
+    images. A gap of a cell is none.
     """
     num, steps = heights.shape[1], int(np.ceil(0.5 * gripper.opening[1] / cell))
     beside = int(np.ceil((gripper.finger[0] + LESS_ROOM[-1]) / cell)) + 1
     lines, margin = int(np.ceil(0.5 * gripper.finger[1] / cell)), steps + beside
-    needed = jnp.asarray(fingers.thickness, jnp.float32) + LESS_ROOM[-1]
+    thickness, most = fingers.thickness, 0.5 * jnp.asarray(fingers.opening, jnp.float32)
 
     def moved(maps: Array, way: int, axis: int) -> Array:  # what lies `way` cells on; 0 outside
         padded = jnp.pad(maps, [(0, 0), *((margin * (axis == one),) * 2 for one in (1, 2))])
@@ -112,8 +112,8 @@ def everywhere(
     tip = jnp.maximum(highest(across, 2) - depth, lowest)
     there = across > tip
 
-    def side(way: int) -> tuple[Array, Array, Array]:
-        on, reach, edge, landing = there, 0.0 * tip, across - tip, 0.0 * tip
+    def side(way: int) -> tuple[Array, Array, Array, Array]:
+        on, reach, edge, landing, wide = there, 0.0 * tip, across - tip, 0.0 * tip, 0.0 * tip
         above = [moved(across, way * step, 2) - tip for step in range(margin + 1)]
         for step in range(1, margin + 1):
             solid = above[step] > 0.0
@@ -121,12 +121,15 @@ def everywhere(
                 on &= solid | (above[step + 1] > 0.0)
                 reach = jnp.where(on & solid, step * cell, reach)
                 edge = jnp.where(on & solid, above[step], edge)
-            lands = ~on & ((step - 1) * cell - reach < needed)
+            lands = ~on & ((step - 1) * cell - reach < thickness + LESS_ROOM[-1])
             landing = jnp.where(lands, jnp.maximum(landing, above[step]), landing)
-        return reach, edge, landing
+            lands = ((step + 0.5) * cell > most) & ((step - 0.5) * cell < most + thickness)
+            wide = jnp.where(lands, jnp.maximum(wide, above[step]), wide)
+        return reach, edge, landing, wide
 
     (back, *one), (ahead, *other) = side(-1), side(1)
-    width, middle = 0.5 * (ahead + back + cell), 0.5 * jnp.abs(ahead - back)
-    edge, landing = jnp.minimum(one[0], other[0]), jnp.maximum(one[1], other[1])
-    found = jnp.stack([width, middle, edge, landing], axis=-1)
+    half, shift, edge = 0.5 * (ahead + back + cell), 0.5 * jnp.abs(ahead - back), one[0]
+    landing, wide = map(jnp.maximum, one[1:], other[1:])  # of fitted fingers, and of open ones
+    landing = jnp.where(half < most, jnp.where(wide > 0.0, landing, 0.0), wide)
+    found = jnp.stack([half, shift, jnp.minimum(edge, other[0]), landing], axis=-1)
     return jnp.where(there[..., None], found, 0.0)
