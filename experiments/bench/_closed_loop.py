@@ -218,7 +218,8 @@ def _move(
         counts["out_of_reach"] += 1
         return scene, False, None
     reported = OUTCOMES[int(step.outcome)] if is_grasp else PUSHED
-    counts[reported] += is_grasp
+    if is_grasp:
+        counts[reported] += 1
     counts["blocks_taken"] += int(step.lifted.sum())
     counts["blocks_lost"] += int(step.blocks_lost)
     return step.scene, bool(step.moved), reported
