@@ -57,7 +57,9 @@ def fit(
     back, ahead = end(-1.0), end(1.0)
     shift, half = 0.5 * (ahead - back), 0.5 * (ahead + back)
     rooms = [jnp.clip(half + room, gripper.half[0], most) for room in (ROOM, *LESS_ROOM)]
-    opened = jnp.select([~blocked(shift, room) for room in rooms], rooms, rooms[0])
+    opened = rooms[0]
+    for room in reversed(rooms):
+        opened = jnp.where(blocked(shift, room), opened, room)
     fits = jnp.any(between) & (half < most) & (~blocked(shift, opened) | blocked(0.0, most))
     return Fit(jnp.where(fits, shift, 0.0), jnp.where(fits, opened, most))
 
