@@ -35,7 +35,7 @@ SAMPLERS = {
     "flashbax": "prioritised, flashbax",
 }
 OURS = "shipped"
-RECORDED = "shipped_general"  # its name in records; their `shipped` left the package
+RECORDED = "shipped_general"  # its rows here; the `shipped` of benchmarks is an earlier one
 NEED_PUSHES = ("blocked", "enclosed", "tray", "hidden")
 NEED_GRASPS = ("target", "cases", "packed", "random10", "random30", "pile", "objects_packed")
 NEED_GRASPS += ("objects10", "target_objects")

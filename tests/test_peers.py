@@ -101,7 +101,7 @@ class Simulator:
 
 
 PEER = Peer(Simulator, Grasp, Pose, "")
-ASIDE = ("oblique", "obliquefit", "generaloblique")
+ASIDE = ("oblique", "obliquefit")
 NOTES = {"clearance": ", tips 4 mm low", **dict.fromkeys(ASIDE, ", oblique")}
 HAND = {"gripper": "franka_hand", "opening": "full"}
 
@@ -159,14 +159,14 @@ def test_shares_are_those_of_the_protocol():
 
 
 def test_page_has_the_recorded_shares():
-    """Claim: the page's table of the exam is the record of `shipped`, which it calls by its former
-    name, and of the baselines: lifted / taken of scenes and openings."""
+    """Claim: the page's table of the exam is the record of `shipped` and of the baselines: lifted /
+    taken of scenes and openings."""
     shares: dict[str, dict[str, str]] = {}
     for name, record in json.loads((index.RESULTS / "bench" / "peers.json").read_text()).items():
         scene, kind = name.split("-")
         for row in record["rows"]:
             values = [100 * row[one]["value"] for one in ("grasp_success", "declutter_rate")]
-            policy = row["policy"].removesuffix("_general")
+            policy = row["policy"]
             if policy not in ("shipped", *exam.BASELINES):
                 continue
             cells = shares.setdefault(f"`{policy}`{NOTES.get(kind, '')}", {})
