@@ -87,12 +87,12 @@ def _highest(
 def everywhere(
     cell: float, heights: Array, depth: float, lowest: float, gripper: Gripper, fingers: Fingers
 ) -> Array:
-    """Sees how the hand would fit at each cell of maps that are closed along their columns.
+    """Sees how a hand that closes along the columns would fit at each cell of its maps.
 
-    Args: cell, its side, m; heights [F, C, C] m; depth, m, of the tips below the surface, and
-    lowest, m, their least height. Returns [F, C, C, 4] m: half the width of what lies between the
-    fingers, the way to its middle, the height of its lower side above the tips, and how far what a
-    finger would come down on stands above them. All are 0 where nothing is, and the same for mirror
+    Args: cell, its side, m; heights [F, C, C] m; depth, m, of the tips below the surface; lowest,
+    m, their least height. Returns [F, C, C, 4] m: half the width of what lies between the fingers,
+    the way to its middle, the height of its lower side above the tips, and how far what a finger
+    would come down on stands above them. All are 0 where nothing is, and the same for mirror
     images. A gap of a cell is none.
     """
     num, steps = heights.shape[1], int(np.ceil(0.5 * gripper.opening[1] / cell))
