@@ -85,7 +85,9 @@ def test_closed_loop(tmp_path: Path):
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     counts = [found[kind]["counts"] for kind in ("none", "d415")]
-    for part, count in zip((found["none"], found["d415"]), counts, strict=True):
+    for kind, count in zip(("none", "d415"), counts, strict=True):
+        part = found[kind]
+        assert part["sensor"] == kind
         assert count["blocks"] == 10
         assert part["grasp_success"]["n"] == count["grasps"] >= 8
         assert count["lifted"] >= 6
