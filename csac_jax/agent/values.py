@@ -13,6 +13,7 @@ from csac_jax.nets import networks
 from csac_jax.vision.heightmap import Observation
 
 SHARPNESS = 10.0  # logit per unit of Q: how the critic's own map enters the actor's
+MOST_CELLS = 2**27  # of the maps that the networks see at once (ours): 0.5 GiB a channel
 _QUARTERS = 4  # parts of a batch that phi is computed for one after the other (ours)
 
 
@@ -45,13 +46,25 @@ def critic_maps(
     """Computes the lower Q of both critics [B, K / 2, h, w, OUTPUTS] in the frames of the passes.
 
     With `mirrored` it is the mean over mirror images and critics. Also returns the first critic's
-    features [B, K / 2, ., ., F].
+    features [B, K / 2, ., ., F]. Large batches are computed in parts of at most MOST_CELLS.
     """
     apply, join = (networks.apply_mirrored, jnp.mean) if mirrored else (networks.apply, jnp.min)
     frames = learner.frames
-    rotated = jax.vmap(maps.rotated_inputs, (None, 0))(frames, obs)
-    q, features = map_critics(lambda variables: apply(frames.networks, variables, rotated), critic)
-    return join(q, axis=0), features[0]
+
+    def look(obs: Observation) -> tuple[jax.Array, Any]:
+        rotated = jax.vmap(maps.rotated_inputs, (None, 0))(frames, obs)
+        q, features = map_critics(lambda own: apply(frames.networks, own, rotated), critic)
+        return join(q, axis=0), features[0]
+
+    num, cells = len(obs.height), frames.yaws.size // 2 * frames.tables.canvas**2
+    fits = (n for n in range(1, num) if num % n == 0 and num // n * cells <= MOST_CELLS)
+    parts = next(fits, num)
+    if parts == 1:
+        return look(obs)
+    # Each part has states of all devices, which divide the first axis.
+    split = jax.tree.map(lambda leaf: leaf.reshape(-1, parts, *leaf.shape[1:]).swapaxes(0, 1), obs)
+    found = jax.lax.map(look, split)
+    return jax.tree.map(lambda leaf: leaf.swapaxes(0, 1).reshape(num, *leaf.shape[2:]), found)
 
 
 def map_critics(call: Callable[[Any], Any], variables: Any) -> Any:

@@ -366,3 +366,22 @@ def test_without_an_actor(learner, state, observations):
     after, loss = actor.update(own, state, observations(2, 4))
     _same(after, state)
     assert loss == 0.0
+
+
+def test_large_batches_are_seen_in_parts(learner, state, observations, monkeypatch):
+    """Claim: maps of a batch in three parts of two states are those of the whole batch."""
+    obs, seen = observations(B, 3), []
+    frames = learner.frames
+    whole = values.dense_maps(learner, state.online, obs)
+    cells = 2 * (frames.yaws.size // 2) * frames.tables.canvas**2
+    monkeypatch.setattr(values, "MOST_CELLS", cells)
+    apply = values.networks.apply
+
+    def counted(networks, own, maps):
+        seen.append(len(maps))
+        return apply(networks, own, maps)
+
+    monkeypatch.setattr(values.networks, "apply", counted)
+    parts = values.dense_maps(learner, state.online, obs)
+    assert set(seen) == {2}
+    jax.tree.map(functools.partial(assert_allclose, atol=1e-5), parts, whole)
