@@ -110,8 +110,9 @@ def everywhere(
         rows = [moved(maps, way, axis) for way in ways]
         return functools.reduce(jnp.maximum, map(jnp.where, under, rows, [0.0] * len(rows)))
 
-    across = highest(heights, 1)
-    tip = jnp.maximum(highest(across, 2) - depth, lowest)
+    apart = jax.lax.optimization_barrier  # else XLA computes each again for every step beside
+    across = apart(highest(apart(heights), 1))
+    tip = apart(jnp.maximum(highest(across, 2) - depth, lowest))
     there = across > tip
 
     def side(way: int) -> tuple[Array, Array, Array, Array]:
@@ -127,7 +128,7 @@ def everywhere(
             landing = jnp.where(lands, jnp.maximum(landing, above[step]), landing)
             lands = ((step + 0.5) * cell > most) & ((step - 0.5) * cell < most + thickness)
             wide = jnp.where(lands, jnp.maximum(wide, above[step]), wide)
-        return reach, edge, landing, wide
+        return apart((reach, edge, landing, wide))
 
     (back, *one), (ahead, *other) = side(-1), side(1)
     half, shift, edge = 0.5 * (ahead + back + cell), 0.5 * jnp.abs(ahead - back), one[0]
