@@ -21,7 +21,7 @@ BEGIN = "<!-- The rest is written by `python -m experiments.summary`. -->\n"
 FAMILIES = ("fast", "general", "objects", "paper", "quick")
 POLICIES = {
     "shipped": (
-        "general/first/seed-1",
+        "general/fit/seed-1",
         (
             *("random10", "random30", "packed", "cases", "pile", "objects_packed", "objects10"),
             *("target", "target_objects", "blocked", "enclosed", "tray", "hidden"),

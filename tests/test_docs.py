@@ -387,7 +387,7 @@ def test_every_module_that_tells_primitives_apart_is_named():
 @pytest.mark.parametrize(
     ("name", "path"),
     [
-        ("shipped", "general/first/seed-1/eval-pile.json"),
+        ("shipped", "general/fit/seed-1/eval-pile.json"),
         ("shipped_clutter", "fast/clutter/seed-1/eval-random30-high.json"),
     ],
 )

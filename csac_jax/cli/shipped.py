@@ -16,7 +16,7 @@ class Measured(NamedTuple):
 
 
 MEASURED = {
-    "shipped": Measured("pile", 97.7, 98.0),
+    "shipped": Measured("pile", 98.3, 98.0),
     "shipped_clutter": Measured("random30", 97.0, 83.0),
 }
 """The result of each in the suite that it is for; docs/results.md has intervals and records."""
