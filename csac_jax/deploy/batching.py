@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 MOST_WAITING = 64  # items
-LONGEST_WAIT = 0.8  # s, by the pace so far: an answer comes within about a second
+LONGEST = 1.0  # s, until the answer to an item that finds others waiting, by the pace so far
 _FORGETTING = 0.2  # share of the newest batch in the pace
 
 
@@ -54,10 +54,10 @@ class Batcher:
 
     @property
     def is_full(self) -> bool:
-        """Returns True if one more item would wait too long."""
+        """Returns True if items wait, and one more would be answered too late."""
         waiting = len(self._waiting)
-        seconds = waiting * self._pace / self._threads
-        return waiting >= MOST_WAITING or seconds > LONGEST_WAIT
+        seconds = (waiting / self._threads + 1.0) * self._pace
+        return waiting >= MOST_WAITING or (waiting > 0 and seconds > LONGEST)
 
     async def ask(self, item: Any) -> Any:
         """Returns the answer to an item. Cancel it to give up. Raises FullError."""

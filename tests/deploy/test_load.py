@@ -237,7 +237,7 @@ def test_failing_policy_stops_nothing(
 def test_full_queue_answers_at_once(start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch):
     """Claim: of 200 clients each is answered or gets the status 429 within a second, in which
     /health answers too."""
-    monkeypatch.setattr(batching, "LONGEST_WAIT", 1e9)
+    monkeypatch.setattr(batching, "LONGEST", 1e9)
     running = start(0.1)
     with concurrent.futures.ThreadPoolExecutor(200) as pool:
         asked = [pool.submit(running.ask, "/decide", BODY) for _ in range(200)]

@@ -276,7 +276,8 @@ def test_policies_say_what_they_were_not_made_for(
 )
 def test_policies_of_both_know_either(change: dict[str, Any]):
     """Claim: nothing warns of task, view or objects of a policy that was trained in both."""
-    cfg = presets.general().change(sim={"physics": "auto"}, sensor=SensorConfig())
+    world = {"sim": {"physics": "auto"}, "sensor": SensorConfig()}
+    cfg = presets.general().change(heightmap={"view": "both"}, **world)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(**change))
