@@ -23,7 +23,7 @@ from tests.deploy import image_files, scenes
 pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
 
-from csac_jax.deploy import decider, server, service  # isort: skip
+from csac_jax.deploy import batching, decider, server, service  # isort: skip
 
 TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
@@ -251,8 +251,9 @@ def test_body_without_a_length_is_limited(server: Server, token: str):
     assert server.ask("GET", "/health") == (200, {"status": "ok"})
 
 
-def test_many_clients_lose_nothing(server: Server):
-    """Claim: 50 clients at once, each with its own `top`, all get their own answer."""
+def test_many_clients_lose_nothing(server: Server, monkeypatch: pytest.MonkeyPatch):
+    """Claim: 50 clients at once that may wait, each with its own `top`, all get their own answer."""
+    monkeypatch.setattr(batching, "LONGEST", 1e9)
     tops = [1 + number % 3 for number in range(CLIENTS)]
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
         asked = [pool.submit(server.ask, "POST", "/decide", {**BODY, "top": n}) for n in tops]
