@@ -252,7 +252,7 @@ def test_body_without_a_length_is_limited(server: Server, token: str):
 
 
 def test_many_clients_lose_nothing(server: Server, monkeypatch: pytest.MonkeyPatch):
-    """Claim: 50 clients at once that may wait, each with its own `top`, all get their own answer."""
+    """Claim: 50 clients that may wait, each with its own `top`, all get their own answer."""
     monkeypatch.setattr(batching, "LONGEST", 1e9)
     tops = [1 + number % 3 for number in range(CLIENTS)]
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
