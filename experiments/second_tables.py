@@ -106,7 +106,8 @@ def values(
     parts: Sequence[str] = (),
     metric: str = COMPLETION,
 ) -> np.ndarray:
-    """Returns a metric of each run [S] of arms, its mean over the parts of a suite."""
+    """Returns a metric of each run [S] of arms, its mean over the parts of a suite; none if one of
+    the arms is not there."""
     found: dict[tuple[str, str], list[float]] = {}
     for place in places:
         part, _, name = place.partition("/")
@@ -114,7 +115,8 @@ def values(
             arm, _, seed = one.path.parts[-4:-1]
             if (arm, one.suite) == (name, suite) and (not parts or one.part in parts):
                 found.setdefault((place, seed), []).append(one.metrics[metric]["value"])
-    return np.array([np.mean(column) for column in found.values()])
+    there = {place for place, _ in found} == set(places)
+    return np.array([np.mean(column) for column in found.values()] if there else [])
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> tuple[Band, float]:

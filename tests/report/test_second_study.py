@@ -283,7 +283,7 @@ def _completion(values: Any) -> dict[str, np.ndarray]:
 def test_verdicts(recorded: Callable[..., Path]):
     """Claim: p is the share of all permutations of seeds with as large a difference of
     interquartile means; Holm counts every row of a hypothesis, also those to come; a seed counts
-    with its mean over parts."""
+    with its mean over parts; a row waits for all of its arms."""
     low, high = np.array([0.1, 0.2, 0.3, 0.4, 0.2]), np.array([0.5, 0.6, 0.7, 0.8, 0.6])
     archives = recorded(
         {
@@ -316,6 +316,8 @@ def test_verdicts(recorded: Callable[..., Path]):
     assert second_tables.judge(archives, crowd)["enclosed"].verdict == "open"
     assert second_tables.judge(archives, rows["H5"])["target"].verdict == "equal"
     assert second_tables.judge(archives, rows["H2"]) == {}
+    two_arms = ("pushes/enclosed-pushes", "settings/to come")
+    assert second_tables.judge(archives, [rows["H1"][0]._replace(ours=two_arms)]) == {}
 
 
 def test_a_control_that_differs_voids(recorded: Callable[..., Path]):
