@@ -24,6 +24,10 @@ import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
 import jax  # isort: skip
 
+from csac_jax import presets
+from csac_jax.io import policy_file
+from tests.networks import random_params
+
 gc.set_threshold(100_000, 20, 100)  # to trace makes many objects that live; 700 collects too often
 
 
@@ -38,3 +42,11 @@ def strict_jax(request: pytest.FixtureRequest) -> Iterator[None]:
             if not request.node.get_closest_marker("optax"):
                 stack.enter_context(jax.numpy_dtype_promotion("strict"))
         yield
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Writes a policy whose decisions take no time, for tests that need any; returns its file."""
+    path = tmp_path_factory.mktemp("policies") / "tiny.safetensors"
+    policy_file.save(path, random_params(presets.smoke()), presets.smoke())
+    return str(path)

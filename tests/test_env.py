@@ -15,8 +15,7 @@ from csac_jax.config import Config, PhysicsKind, SceneConfig, SimConfig, TaskCon
 from csac_jax.constants import CHANGE_AREA, Outcome, Primitive
 from csac_jax.env import AutoResetEnv, Env, State, make_env
 from csac_jax.robot.primitives import Action
-from csac_jax.scenes import pool
-from csac_jax.sim import backend, physics as simulation
+from csac_jax.sim import physics as simulation
 from csac_jax.world import blocks, model, scene_state
 from csac_jax.world.scene_state import SceneState
 
@@ -441,10 +440,3 @@ def test_actions_are_built_from_numbers_or_arrays():
     for many in (Action.push(xs, 0.1, xs[::-1]), batch):
         np.testing.assert_array_equal(many.primitive, np.full(3, Primitive.PUSH))
         np.testing.assert_array_equal(many.pose, wanted)
-
-
-def test_make_env_chooses_physics(monkeypatch: pytest.MonkeyPatch):
-    """Claim: `make_env` resolves physics `auto`: its config names the physics that it runs."""
-    monkeypatch.setattr(pool, "scenes", lambda *_: None)
-    cfg = CONFIG.change(sim={"physics": "auto"})
-    assert make_env(cfg).cfg.sim == backend.resolve(cfg).sim != cfg.sim

@@ -15,10 +15,9 @@ import pytest
 
 from csac_jax import api, deploy, grippers, presets
 from csac_jax.agent import actor_critic, values
-from csac_jax.agent.actor_critic import Params
 from csac_jax.baselines import oracle
 from csac_jax.cli import main
-from csac_jax.config import Config, PhysicsKind
+from csac_jax.config import PhysicsKind
 from csac_jax.env import Env, State, make_env
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Fingers
@@ -28,6 +27,7 @@ from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.networks import learner_state, random_params
 from tests.world import placed
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
@@ -47,11 +47,6 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
 @pytest.fixture(scope="module")
 def states(env: Env) -> State:
     return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
-
-
-def _networks(cfg: Config) -> Params:
-    learner = actor_critic.make(cfg)
-    return jax.jit(lambda key: actor_critic.init(key, learner).online)(jax.random.key(1))
 
 
 def _scene(fingers: Fingers = THIN) -> SceneState:
@@ -195,7 +190,7 @@ def test_oracle_takes_what_fits(env: Env):
 
 def test_net_sees_the_fingers(states: State):
     """Claim: Q follows the fingers, which a stored observation keeps."""
-    learner, params = actor_critic.make(CONFIG), _networks(CONFIG)
+    learner, params = actor_critic.make(CONFIG), random_params(CONFIG)
     look = jax.jit(functools.partial(values.dense_maps, learner, params))
     obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
     same = obs.replace(fingers=obs.fingers[:1].repeat(2, axis=0))
@@ -207,34 +202,33 @@ def test_net_sees_the_fingers(states: State):
 
 def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
     """Claim: networks without the last inputs, gripper, target and how the hand fits, are a start:
-    Q is the same for all fingers, and the nets still see the gripper. Those that lack another input
-    are refused."""
+    Q is the same for all fingers and targets, and the nets still see the gripper. Those that lack
+    another input are refused."""
     blind = presets.smoke().change(sim={"physics": "c"})
-    params, path = _networks(blind), tmp_path / "policy.safetensors"
+    params, path = random_params(blind), tmp_path / "policy.safetensors"
     policy_file.save(path, params, blind)
     changes: Any = {"task": {"kind": "target"}}, {"net": {"fit": True}}
     for cfg in (CONFIG, *(CONFIG.change(**one) for one in changes)):
-        start: Any = api.initial_networks(cfg, path)
-        learner = actor_critic.make(cfg)
-        fresh = jax.jit(lambda key, learner=learner: actor_critic.init(key, learner))
-        found = start(fresh(jax.random.key(3))).online
-        obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
+        start: Any = api.initialrandom_params(cfg, path)
+        found = start(learner_state(cfg, 3)).online
+        target = np.random.default_rng(1).uniform(size=states.obs.target[:2].shape) < 0.5
+        obs = jax.tree.map(lambda leaf: leaf[:2], states.obs).replace(target=target)
         seen, both = (
             jax.jit(functools.partial(values.dense_maps, learner))(params, obs)
             for learner, params, obs in (
                 (actor_critic.make(blind), params, obs.replace(fingers=None)),
-                (learner, found, obs),
+                (actor_critic.make(cfg), found, obs),
             )
         )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
-    found = api.match_networks(CONFIG.change(net={"fit": True}), "shipped_clutter").net
+    found = api.matchrandom_params(CONFIG.change(net={"fit": True}), "shipped_clutter").net
     assert found.gripper
     assert found.fit
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)
-        policy_file.save(path, _networks(other), other)
+        policy_file.save(path, random_params(other), other)
         with pytest.raises(SettingsError, match="its networks are not those of these settings"):
-            api.initial_networks(CONFIG.change(task={"kind": "target"}), path)
+            api.initialrandom_params(CONFIG.change(task={"kind": "target"}), path)
 
 
 @pytest.mark.mjx
@@ -242,7 +236,7 @@ def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str
     """Claim: a policy for any gripper is exported as it is; a program, or a decision for a robot,
     asks for its gripper in one line."""
     path, program_file = tmp_path / "policy.safetensors", tmp_path / "program.onnx"
-    policy_file.save(path, _networks(CONFIG), CONFIG)
+    policy_file.save(path, random_params(CONFIG), CONFIG)
     assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0
     with pytest.raises(SettingsError, match=f"^{ASKED}"):
         deploy.CameraPolicy.load(path).warm_up(64, 48)

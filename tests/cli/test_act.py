@@ -25,9 +25,9 @@ EMPTY = scenes.take(scenes.blocks_at([[3.0, 3.0, 0.0]]))
 
 
 @pytest.fixture
-def given(tmp_path: Path) -> list[str]:
+def given(tiny: str, tmp_path: Path) -> list[str]:
     """The policy and the files of an image of two blocks."""
-    return ["shipped_clutter", *image_files.write(tmp_path, IMAGE)]
+    return [tiny, *image_files.write(tmp_path, IMAGE)]
 
 
 def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -39,7 +39,7 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
     assert "trained with view maps from above, not noisy images of an obl" in printed.err
     lines = printed.out.splitlines()
     result = json.loads((tmp_path / "out.json").read_text())
-    wanted = CameraPolicy.load("shipped_clutter").decide(*IMAGE, top=2)
+    wanted = CameraPolicy.load(given[0]).decide(*IMAGE, top=2)
     assert len(lines) == len(result["decisions"]) == 2
     for line, found, decision in zip(lines, result["decisions"], wanted, strict=True):
         assert f"{decision.primitive} at x {found['position'][0]:+.3f}" in line
@@ -49,7 +49,7 @@ def test_decides(given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture
     assert imageio.imread(tmp_path / "out.png").shape == (640, 1248, 3)
     (tmp_path / "out.png").unlink()
     empty = image_files.write(tmp_path / "empty", EMPTY)
-    assert cli.main(["act", "shipped_clutter", *empty, *files[2:]]) == 0
+    assert cli.main(["act", given[0], *empty, *files[2:]]) == 0
     assert capsys.readouterr().out == "nothing to act on\n"
     assert (tmp_path / "out.png").stat().st_size > 10_000
 
@@ -85,7 +85,7 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     names = ("rgb.png", "depth.npy", "intrinsics.json", "pose.json")
     paths = [record / "000001" / name for name in names]
     files = [part for path in paths for part in (f"--{path.stem}", str(path))]
-    assert cli.main(["act", "shipped_clutter", *files]) == 0
+    assert cli.main(["act", given[0], *files]) == 0
     assert capsys.readouterr().out.splitlines() == [first]
     depth = imageio.imread(tmp_path / "depth.png")
     imageio.imwrite(tmp_path / "depth.png", (10 * depth.clip(0, 6000)).astype(np.uint16))
@@ -94,7 +94,7 @@ def test_record_decides_the_same(given: list[str], tmp_path: Path, capsys: pytes
     assert sorted(path.name for path in record.iterdir()) == ["000001", "record.json"]
 
 
-def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_check_of_the_empty_table(tiny: str, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: --check accepts a right pose; it refuses one that is 2 cm off, a table with blocks,
     and a camera that sees too little, each by one line."""
     low = EMPTY.pose + np.diag([0, 0, 0.02], 1)
@@ -107,10 +107,7 @@ def test_check_of_the_empty_table(tmp_path: Path, capsys: pytest.CaptureFixture)
         (beside, 1, "too little of the workspace is seen"),
     ):
         options, json_file = image_files.write(tmp_path, image), tmp_path / "report.json"
-        assert (
-            cli.main(["act", "shipped_clutter", *options, "--check", "--json", str(json_file)])
-            == code
-        )
+        assert cli.main(["act", tiny, *options, "--check", "--json", str(json_file)]) == code
         captured = capsys.readouterr()
         assert line in captured.out + captured.err
         assert re.search(r"^table +[-+]\d+\.\d mm from z = 0, tilted by", captured.out)
@@ -201,7 +198,7 @@ def test_command_needs_no_mujoco(given: list[str], tmp_path: Path):
     command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "act", *given, *files]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert " 1 grasp at x " in done.stdout
+    assert " at x " in done.stdout
     command[4] = str(tmp_path)
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

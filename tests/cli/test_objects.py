@@ -5,13 +5,10 @@ import json
 from pathlib import Path
 
 import imageio.v2 as imageio
-import numpy as np
 import pytest
 
 from csac_jax import cli, grippers
-from csac_jax.cli import objects
-from csac_jax.objects import importing, library, tables
-from csac_jax.render import sheet
+from csac_jax.objects import importing, library
 
 Capture = pytest.CaptureFixture[str]
 
@@ -33,25 +30,6 @@ def test_make_and_show(tmp_path: Path, capsys: Capture):
     assert cli.main(["objects", "make", "--mixed", "--count", "4", "--out", str(mixed)]) == 0
     names = [member.name for member in library.load(mixed).objects]
     assert names == ["bottle-0-0", "assembly-0-0", "bowl-0-1", "assembly-0-1"]
-
-
-def test_names_are_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
-    """Claim: `objects show` prints whole names where the table has little room."""
-    monkeypatch.setenv("COLUMNS", "60")
-    member = tables.find("procedural:0:1", "all").objects[0]
-    long = dataclasses.replace(member, name="a_very_long_name_of_a_mesh_file_from_somewhere_else")
-    objects._list([long])
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\u2502")]
-    assert "".join(row.split("\u2502")[1].strip() for row in rows) == long.name
-
-
-def test_sheet_of_one_object_is_small_and_shows_its_name(tmp_path: Path):
-    """Claim: a sheet is as wide as its objects need, and cuts no name at its upper edge."""
-    sheet.write(tmp_path / "one.png", tables.find("procedural:0:1", "all").objects)
-    picture = imageio.imread(tmp_path / "one.png")
-    assert picture.shape[1] < picture.shape[0]
-    ink = np.flatnonzero(picture[: len(picture) // 5].min(axis=(1, 2)) < 100)
-    assert 0 < ink.min() < ink.max() < 0.2 * len(picture) - 1
 
 
 def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):

@@ -25,6 +25,7 @@ from csac_jax.io import policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.vision import heightmap
 from tests.deploy import scenes
+from tests.networks import random_params
 
 pytestmark = pytest.mark.optax
 
@@ -36,9 +37,7 @@ LEFT, RIGHT = (-0.1, 0.0), (0.1, 0.05)
 @pytest.fixture(scope="module")
 def policy() -> CameraPolicy:
     """Returns an untrained policy."""
-    learner = actor_critic.make(CFG)
-    params = jax.jit(lambda: actor_critic.init(jax.random.key(3), learner).online)()
-    return CameraPolicy(CFG, params)
+    return CameraPolicy(CFG, random_params(CFG, 3, 0.1))
 
 
 def _take(*places: tuple[float, float]) -> scenes.Image:

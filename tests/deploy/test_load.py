@@ -280,19 +280,6 @@ def test_nobody_waits_nothing_is_decided(start: Callable[..., Service], tmp_path
     assert len(record.read(tmp_path)) == 1
 
 
-def test_stop_answers_what_was_accepted(start: Callable[..., Service]):
-    """Claim: a service that is stopped answers what waits, closes silent connections and ends."""
-    running = start(0.3)
-    silent = running.connect()
-    with concurrent.futures.ThreadPoolExecutor(10) as pool:
-        asked = [pool.submit(running.ask, "/decide", BODY) for _ in range(10)]
-        _until(lambda: len(running.policy.batches) >= decider.THREADS)
-        time.sleep(0.2)
-        assert running.stop() < 10.0
-        assert [future.result()[0] for future in asked] == [200] * 10
-    assert silent.recv(1) == b""
-
-
 def test_memory_of_bodies_is_bounded(
     start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch
 ):

@@ -71,15 +71,15 @@ class Server:
 
 
 @pytest.fixture(scope="module")
-def policy() -> CameraPolicy:
-    loaded = CameraPolicy.load("shipped_clutter")
+def policy(tiny: str) -> CameraPolicy:
+    loaded = CameraPolicy.load(tiny)
     loaded.warm_up(640, 480, decider.batches())
     return loaded
 
 
 @pytest.fixture(scope="module", name="server")
 def _server(policy: CameraPolicy) -> Iterator[Server]:
-    running = Server(service.make(policy, "shipped_clutter", TOKEN))
+    running = Server(service.make(policy, "tiny", TOKEN))
     yield running
     running.stop()
 
@@ -87,9 +87,7 @@ def _server(policy: CameraPolicy) -> Iterator[Server]:
 @pytest.fixture
 def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Server]:
     """Starts a service that records into the test's folder."""
-    running = Server(
-        service.make(policy, "shipped_clutter", TOKEN, Recorder(tmp_path, "shipped_clutter"))
-    )
+    running = Server(service.make(policy, "tiny", TOKEN, Recorder(tmp_path, "tiny")))
     yield running
     running.stop()
 
@@ -125,6 +123,7 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
         ({"id": "000001", "outcome": "good"}, 422, "'outcome' should be 'nothing'"),
         ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "'number' should be"),
         ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
+        ({"id": "000001", "outcome": "lifted", "number": 3}, 400, "there are 1 decisions, not 3"),
     ],
 )
 def test_bad_outcomes_are_refused(
@@ -173,7 +172,7 @@ def test_health_and_version(server: Server):
     """Claim: /health needs no token; /version names policy and versions."""
     assert server.ask("GET", "/health", token="") == (200, {"status": "ok"})
     status, answer = server.ask("GET", "/version")
-    assert (status, answer["policy"]) == (200, "shipped_clutter")
+    assert (status, answer["policy"]) == (200, "tiny")
     assert {"python", "jax", "csac-jax"} <= set(answer["versions"])
 
 

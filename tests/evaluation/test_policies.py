@@ -15,6 +15,7 @@ from csac_jax.env import State
 from csac_jax.evaluation import policies
 from csac_jax.evaluation.policies import GeometricPolicy, NetworkPolicy, OraclePolicy, RandomPolicy
 from csac_jax.io import checkpoint, policy_file
+from tests.networks import random_params
 
 pytestmark = pytest.mark.mjx
 
@@ -25,10 +26,8 @@ SCENES = 3
 
 @pytest.fixture(scope="module")
 def learned() -> NetworkPolicy:
-    """Networks as they begin."""
-    parts = actor_critic.make(CFG)
-    params = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0)).online
-    return NetworkPolicy(CFG, params)
+    """Networks that no training gives."""
+    return NetworkPolicy(CFG, random_params(CFG))
 
 
 @pytest.fixture(scope="module")

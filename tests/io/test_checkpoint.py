@@ -138,11 +138,6 @@ def test_paths_that_orbax_misreads_are_refused(tmp_path: Path, name: str):
         checkpoint.check_path(tmp_path / name)
 
 
-def test_extra_content_comes_back(run_dir: Path):
-    """Claim: what was saved beside the state is read without it."""
-    assert checkpoint.load_extra(run_dir) == {"seconds": 4.0, "grasps": [0, 1]}
-
-
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -246,35 +241,6 @@ def test_threads_that_write_on_leave_no_draft(run_dir: Path, monkeypatch: pytest
 def _failing_from(name: str, call: Any, fail: Any) -> Any:
     """Returns `call`, or `fail` for a first argument of this name."""
     return lambda path, target: (fail if path.name == name else call)(path, target)
-
-
-def _flip(position: float) -> Callable[[Path], None]:
-    def flip(file: Path) -> None:
-        data = bytearray(file.read_bytes())
-        data[int(position * len(data))] ^= 1
-        file.write_bytes(data)
-
-    return flip
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (_flip(0.0), "has changed"),
-        (_flip(0.5), "has changed"),
-        (_flip(0.99), "has changed"),
-        (lambda file: file.write_bytes(file.read_bytes()[:-1]), "has changed"),
-        (Path.unlink, "is missing"),
-    ],
-)
-def test_damage_is_seen(run_dir: Path, damage: Callable[[Path], None], message: str):
-    """Claim: a step with a flipped bit, a cut-off file or without one is not restored; the newest
-    sound one is, with a warning that names the file. One without manifest is half-written."""
-    file = _data_file(run_dir, 8)
-    damage(file)
-    _falls_back(run_dir, f"is damaged.*{file.name} {message}")
-    (run_dir / "checkpoints" / "8" / checkpoint.MANIFEST).unlink()
-    _falls_back(run_dir, "is missing or half-written")
 
 
 def test_steps_of_others_are_seen(run_dir: Path, tmp_path_factory: pytest.TempPathFactory):
