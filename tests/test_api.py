@@ -143,12 +143,19 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[api.Run, list[Rec
 @pytest.mark.optax
 def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
     """Claim: a run returns its folder, config and summary; each chunk's record reaches the
-    callbacks."""
+    callbacks. Its own record is that of the command: its end, wall time, config, device, versions
+    and commit."""
     run, records = trained
     assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
     assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
     assert capsys.readouterr().out == ""
     assert configs.load_config(run.run_dir / "config.json") == run.cfg
+    record = files.read_object(run.run_dir / files.RECORD)
+    assert record["run_dir"] == str(run.run_dir)
+    assert record["wall_seconds"] >= record["seconds"]
+    assert configs.from_dict(record["config"]) == run.cfg
+    for known in (run.summary._asdict(), provenance.record()):
+        assert {name: record[name] for name in known} == known
 
 
 @pytest.mark.slow
@@ -232,20 +239,6 @@ def test_run_names_its_own_parts(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert cli.main(["train", "--resume", str(run.run_dir)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"these settings are of a run with {name}, none is given" in line
-
-
-@pytest.mark.mjx
-@pytest.mark.optax
-def test_run_has_a_record(trained):
-    """Claim: a run of the API has the record that the command's has: its end, wall time, config,
-    device, versions and commit."""
-    run, _ = trained
-    record = files.read_object(run.run_dir / files.RECORD)
-    assert record["run_dir"] == str(run.run_dir)
-    assert record["wall_seconds"] >= record["seconds"]
-    assert configs.from_dict(record["config"]) == run.cfg
-    for known in (run.summary._asdict(), provenance.record()):
-        assert {name: record[name] for name in known} == known
 
 
 @pytest.mark.slow

@@ -1,5 +1,4 @@
-"""A config that cannot work is refused as it is built, by the name of the setting. The camera has a
-table of its own."""
+"""A config that cannot work is refused as it is built, by the name of the setting."""
 
 import dataclasses
 import math
@@ -98,6 +97,9 @@ def test_values_out_of_range(name: str, values: list):
         ({"sim.physics": "warp", "scene.size_jitter": (0.0, 0.1)}, "scene.size_jitter: the second"),
         ({"scene.slots": ()}, "scene.slots: at least one"),
         ({"camera.size": (8192, 480)}, "camera.size: must be at most 4096"),
+        ({"camera.size": (320, 240)}, "camera.centre: "),
+        ({"camera.focal": (618.0, 300.0)}, "camera.focal: "),
+        ({"camera.position": (0.0, 0.0, 0.7)}, "camera.position: "),
         ({"sensor.pose_noise": (0.01, 0.0)}, "sensor.pose_noise: must be 0"),
         ({"net.subpixel": 4, "net.stride": 2}, "net.subpixel: at most net.stride"),
         ({"heightmap.size": 2**31}, "heightmap.size: must be at most 1024"),

@@ -209,7 +209,7 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
     policy_file.save(path, params, blind)
     changes: Any = {"task": {"kind": "target"}}, {"net": {"fit": True}}
     for cfg in (CONFIG, *(CONFIG.change(**one) for one in changes)):
-        start: Any = api.initialrandom_params(cfg, path)
+        start: Any = api.initial_networks(cfg, path)
         found = start(learner_state(cfg, 3)).online
         target = np.random.default_rng(1).uniform(size=states.obs.target[:2].shape) < 0.5
         obs = jax.tree.map(lambda leaf: leaf[:2], states.obs).replace(target=target)
@@ -221,14 +221,14 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
             )
         )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
-    found = api.matchrandom_params(CONFIG.change(net={"fit": True}), "shipped_clutter").net
+    found = api.match_networks(CONFIG.change(net={"fit": True}), "shipped_clutter").net
     assert found.gripper
     assert found.fit
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)
         policy_file.save(path, random_params(other), other)
         with pytest.raises(SettingsError, match="its networks are not those of these settings"):
-            api.initialrandom_params(CONFIG.change(task={"kind": "target"}), path)
+            api.initial_networks(CONFIG.change(task={"kind": "target"}), path)
 
 
 @pytest.mark.mjx
@@ -240,7 +240,6 @@ def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0
     with pytest.raises(SettingsError, match=f"^{ASKED}"):
         deploy.CameraPolicy.load(path).warm_up(64, 48)
-    deploy.CameraPolicy.load(path, gripper="2f85").warm_up(64, 48)
     given = ["export", str(path), str(program_file), "--format", "onnx"]
     capsys.readouterr()
     assert main(given) == 2

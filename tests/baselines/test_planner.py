@@ -132,12 +132,6 @@ def test_key_decides():
     np.testing.assert_array_equal(both.pose, [one.pose, other.pose])
 
 
-def test_planner_needs_the_state():
-    """Claim: an observation is refused, in one line."""
-    with pytest.raises(TypeError, match="give it a State"):
-        PlannerPolicy(CFG)(_start(CFG).obs, jax.random.key(0))
-
-
 @pytest.fixture(scope="module")
 def learned() -> NetworkPolicy:
     """Networks that no training gives."""

@@ -306,21 +306,6 @@ def test_slots_are_always_inside(sampler, size, progress):
 
 
 @pytest.mark.parametrize(
-    ("progress", "law"), [(-1.0, "normal"), (0.3, "one giant"), (1.0, "normal")]
-)
-def test_weights_by_formula(progress, law):
-    """Claim: w_i = (n P(i))^-beta / max_j w_j, beta from first to second of `is_beta` in a line."""
-    sampler = prioritised(is_beta=(0.2, 0.8))
-    errors = LAWS[law](np.random.default_rng(0)).astype(np.float32)
-    slots, weights = drawn(sampler, stored(sampler, errors, 900), 64, progress)
-    mass = (np.abs(errors[:900].astype(float)) + sampler.cfg.per_epsilon) ** sampler.cfg.alpha
-    exponent = 0.2 + 0.6 * np.clip(progress, 0.0, 1.0)
-    expected = (900 * mass / mass.sum())[slots] ** -exponent
-    assert_allclose(weights, expected / expected.max(), rtol=2e-5)
-    assert np.unique(weights).size > 1
-
-
-@pytest.mark.parametrize(
     ("progress", "expected"),
     [(-1.0, (0.5, 0.5)), (0.0, (0.5, 0.5)), (0.2, (0.75, 0.75)), (0.4, (1.0, 1.0)),
      (0.7, (1.0, 6.5)), (1.0, (1.0, 12.0)), (2.0, (1.0, 12.0))],
