@@ -69,31 +69,6 @@ def run_dir(tmp_path: Path) -> Path:
     return _saved(tmp_path / "runs" / "one", SMOKE)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("trian quick", "'trian'; did you mean train? choose one of: demo, train, sweep"),
-        ("train --seed 3", "give a preset first, one of: smoke, quick"),
-        ("train quik", "unknown preset 'quik'; did you mean quick? choose one of: smoke, quick"),
-        ("train quick --learn.bath 3", "--learn.bath 3; perhaps you meant --learn.batch; see csac"),
-        ("train quick --learn.tau 2", "learn.tau: must be at most 1, not 2.0"),
-        ("train quick --net.norm=batch", "--net.norm=batch: --net.kind small has no such setting"),
-        ("train smoke --device tpu", "--device: 'tpu' is not one of: cpu, gpu"),
-        ("train quick smoke", "unknown arguments: smoke"),
-        ("train smoke --sim.physics warp --scene.size-jitter 0.1 0", "warp computes on CUDA"),
-        ("eval", "these arguments are missing: source"),
-        ("eval . --episodes 0", "--episodes: at least 1"),
-        ("eval shipped --which worst", "--which: 'worst' is neither best, last nor a step"),
-        ("eval shipped --suite nowhere", "'nowhere' is neither a case file nor one of: in_distr"),
-        ("doctor --build", "--build: only warp has kernels to build, and sim.physics is c here"),
-        ("bench spet", "bench: unknown benchmark 'spet'; choose one of: "),
-    ],
-)
-def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
-    """Claim: bad arguments are one line that names the thing, and exit code 2."""
-    _fails(capsys, 2, arguments, message)
-
-
 def test_long_work_is_logged(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     """Claim: the package's log is one line on stderr while a command runs, also where a library has
     given the root logger a handler; a repeated warning is one line of a command."""
@@ -363,13 +338,6 @@ def test_eval_changes_how_a_policy_decides(
     failures; without them, the policy acts as it was trained to."""
     _fails(capsys, 2, f"eval shipped --suite random10 {flags}")
     assert asked[0].policy == policies.load_config("shipped").change(policy=expected).policy
-
-
-def test_ring_larger_than_memory(capsys: pytest.CaptureFixture, tmp_path: Path):
-    """Claim: a ring that memory cannot hold is refused before anything is compiled or written, by
-    one line and exit code 2."""
-    _fails(capsys, 2, f"train quick --replay.capacity {2**30}", "replay.capacity: ")
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

@@ -85,24 +85,6 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
 
 
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ("--suites cases target", "--suites: several need --out DIR"),
-        ("--suites all", "--suites: several need --out DIR"),
-        ("--out . --json a.json", "--json: is for a single suite"),
-        ("--out . --share 0", "--share: above 0"),
-        ("--out . --jobs -1", "--jobs: must lie in"),
-        ("--out . --suites nowhere", "'nowhere' is neither a case file nor one of"),
-    ],
-)
-def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
-    """Claim: arguments that do not fit are one line, exit code 2."""
-    assert cli.main(["eval", "shipped", *flags.split()]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-
-
 def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: each suite is measured with the modules of --import, in a process of its own too, to
     which its options can be sent."""

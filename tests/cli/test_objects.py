@@ -41,34 +41,6 @@ def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capt
     assert last.startswith("wider than the hand opens, 30 mm: ")
 
 
-REFUSED = {
-    "": (2, "usage"),
-    "mak": (2, "mak"),
-    "make --out x --count 9999": (2, "--count"),
-    "make --out x --seed -1": (2, "--seed"),
-    "make --out .": (2, "--out: . exists"),
-    "show nowhere": (1, "nowhere: no library"),
-    "show procedural:0:3 --png x.txt": (2, ".png"),
-    "import nowhere --out x": (2, "nowhere does not exist"),
-    "import . --out x": (2, "no mesh file"),
-    "import . --out x --density 5": (2, "--density"),
-}
-
-
-@pytest.mark.parametrize("command", REFUSED)
-def test_what_is_refused(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-):
-    """Claim: bad arguments and libraries are one line, exit code 2 or 1, and nothing is written."""
-    monkeypatch.chdir(tmp_path)
-    code, message = REFUSED[command]
-    assert cli.main(["objects", *command.split()]) == code
-    said = "".join(capsys.readouterr())
-    assert message in said
-    assert len(said.splitlines()) == 1
-    assert not any(tmp_path.iterdir())
-
-
 def test_without_the_extra_the_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ):
@@ -76,17 +48,3 @@ def test_without_the_extra_the_command_says_so(
     monkeypatch.setattr(importing, "MODULES", ("no_such_module",))
     assert cli.main(["objects", "import", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "pip install 'csac-jax[objects]'" in capsys.readouterr().err
-
-
-def test_suites_need_a_library(capsys: Capture):
-    """Claim: `eval` and `play` refuse a suite of objects without a library, and the other way."""
-    for arguments, message in (
-        (["eval", "shipped_clutter", "--suite", "pile"], "objects: pile needs a library"),
-        (
-            ["eval", "shipped_clutter", "--objects", "x"],
-            "'in_distribution' has no objects of a library",
-        ),
-        (["play", "--scene", "pile"], "objects: pile needs a library"),
-    ):
-        assert cli.main(arguments) == 2
-        assert message in capsys.readouterr().err

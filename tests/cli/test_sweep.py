@@ -20,7 +20,6 @@ from csac_jax.training import programs, step
 from tests.training import toys
 
 SMOKE = presets.smoke()
-TAUS = ",".join(f"0.{i:03d}" for i in range(100, 205))
 RUN = runner.run
 
 
@@ -34,43 +33,6 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(runner, "run", forbidden)
     monkeypatch.setattr(signals, "install", signals.Stop)
-
-
-def _fails(capsys: pytest.CaptureFixture, code: int, arguments: str, message: str) -> None:
-    """Runs a sweep that must fail with this code and line, before a folder is made."""
-    assert cli.main(["sweep", *arguments.split()]) == code
-    captured = capsys.readouterr()
-    assert (captured.out, captured.err.count("\n")) == ("", 1)
-    assert message in captured.err
-    assert list(Path().iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("smoke --seeds 2 --seed 2147483647", "no seed may exceed 2147483647"),
-        ("smoke --vary replay.sampler=uniform --replay.end 1 4", "uniform has no such setting"),
-        ("smoke --vary learn.tau=x,0.1", "--learn.tau: could not convert string to float: 'x'"),
-        ("smoke --devices 4096", "devices: 4096 asked for, there are "),
-        ("smoke --sim.physics c --devices 2", "--sim.physics: c computes on the host's cores"),
-        (
-            "smoke --replay.capacity 65536 --seeds 9999",
-            "lower seeds, set together or raise devices",
-        ),
-        (f"smoke --vary learn.tau={TAUS} --vary target.gamma={TAUS}", "more than 10000"),
-        ("smoke --cluster", "several processes need --run-dir"),
-        (
-            "smoke --run-dir y --coordinator a:1 --processes 2 --process-id 2",
-            "process_id: must lie in 0 .. 1",
-        ),
-        ("--resume x --learn.tau 0.1", "leave all others out"),
-    ],
-)
-def test_bad_arguments(capsys: pytest.CaptureFixture, arguments: str, message: str):
-    """Claim: what cannot be swept is one line that names the thing, exit code 2, and no folder is
-    made; a folder without a sweep is exit code 1."""
-    _fails(capsys, 2, arguments, message)
-    _fails(capsys, 1, "--resume nowhere", "there is no sweep.json in nowhere")
 
 
 def test_settings_reach_their_configs():

@@ -54,28 +54,6 @@ def _is_red(image: np.ndarray) -> np.ndarray:
     return image[..., 0] > 40 + image[..., 1:].max(axis=2).astype(int)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        ("--scene nowhere", 2, "--scene: 'nowhere' is neither a case file nor one of: random"),
-        ("--scene cases", 2, "--scene: cases has several parts"),
-        ("--size 95 64", 2, "--size: both numbers must be even"),
-        ("--policy nowhere", 1, "there is no folder nowhere"),
-        ("--png a.txt", 2, "a.txt: its name must end in"),
-        ("--video a.png", 2, "a.png: its name must end in"),
-    ],
-)
-def test_bad_arguments_are_one_line(
-    here, capsys: pytest.CaptureFixture, arguments: str, code: int, message: str
-):
-    """Claim: what cannot be played is one line that names it, before anything is simulated."""
-    assert cli.main(["play", *arguments.split()]) == code
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
-
-
 @pytest.mark.parametrize(("scene", "kind"), [("enclosed", "target"), ("blocked", "clear")])
 def test_policies_without_networks_have_the_task_of_the_scene(scene: str, kind: str):
     """Claim: the planner gets the marked block in a suite that marks one, else it clears."""
