@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -46,7 +47,8 @@ def strict_jax(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Writes a policy whose decisions take no time, for tests that need any; returns its file."""
-    path = tmp_path_factory.mktemp("policies") / "tiny.safetensors"
-    policy_file.save(path, random_params(presets.smoke()), presets.smoke())
-    return str(path)
+    """Writes a policy that grasps and takes no time, for tests that need any; returns its file."""
+    grasps: Any = {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}}
+    cfg, path = presets.smoke().change(**grasps), tmp_path_factory.mktemp("policies") / "tiny"
+    policy_file.save(path.with_suffix(".safetensors"), random_params(cfg), cfg)
+    return str(path.with_suffix(".safetensors"))

@@ -24,6 +24,7 @@ from csac_jax.cli import parsing, sweep
 from csac_jax.evaluation import suites
 from csac_jax.io import checkpoint, configs, policy_file
 from experiments import index
+from tests.networks import random_params
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
@@ -64,15 +65,23 @@ def commands(page: Path) -> Iterator[list[str]]:
             yield words[1:] if words[0] == "srun" else words
 
 
+@pytest.fixture
+def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Puts a tiny policy of both tasks in the place of `shipped`."""
+    cfg, path = presets.smoke().change(task={"kind": "both"}), tmp_path / "shipped.safetensors"
+    policy_file.save(path, random_params(cfg), cfg)
+    monkeypatch.setitem(policy_file.SHIPPED, "shipped", path)
+
+
 @pytest.mark.mjx
 @pytest.mark.optax
+@pytest.mark.usefixtures("shipped")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_blocks_run(page: Path, tiny: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the blocks of a page run, one after the other, with a small preset for `quick` and a
     tiny policy for `shipped`, few episodes and few seeds, in a folder with a recorded run;
     `train_fn` is traced alone."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(policy_file.SHIPPED, "shipped", Path(tiny))
     matplotlib.use("Agg")
     (tmp_path / "runs" / "first").mkdir(parents=True)
     log = record("quick/csac_beta/seed-0/metrics.jsonl")
@@ -203,10 +212,10 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
     return len(steps)
 
 
-def test_robot_page_runs(tiny: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.usefixtures("shipped")
+def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, with a tiny policy
     for `shipped`."""
-    monkeypatch.setitem(policy_file.SHIPPED, "shipped", Path(tiny))
     for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)

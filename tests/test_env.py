@@ -203,25 +203,21 @@ def test_auto_reset_replaces_finished_scenes_alone(lab: Lab, stepped: State):
 
 
 def test_failures_end_an_episode(lab: Lab):
-    """Claim: with `max_failures` that many failed grasps in a row truncate an episode."""
-    env = dataclasses.replace(lab.env, max_failures=2)
-    state, step = jax.jit(env.reset_to)(_cube(0.0, 0.0)), jax.jit(env.step)
-    for failed, stops in ((0, False), (1, True)):
-        after = step(state.replace(failed_grasps=jnp.int32(failed)), Action.grasp(*BARE))
-        assert (bool(after.truncated), bool(after.terminated)) == (stops, False)
-
-
-def test_failures_end_episodes_of_certified_scenes(lab: Lab):
-    """Claim: of a pool with certified and other scenes, failed grasps in a row end the episodes in
-    certified ones alone. A scene that is not of the pool is none."""
+    """Claim: with `max_failures` that many failed grasps in a row truncate an episode; of a pool
+    with certified and other scenes, in certified ones alone. A scene that is not of the pool is
+    none."""
+    alone = dataclasses.replace(lab.env, max_failures=2)
     scene = {"certified": ("blocked",), "certified_fraction": 0.5}
-    env = dataclasses.replace(lab.env, max_failures=2, cfg=CONFIG.change(scene=scene))
-    step, action = jax.jit(env.step), Action.grasp(*BARE)
-    for certified in (None, False, True):
+    mixed = dataclasses.replace(alone, cfg=CONFIG.change(scene=scene))
+    for env, certified, failed, stops in (
+        *((alone, None, failed, failed == 1) for failed in (0, 1)),
+        *((mixed, flag, 1, bool(flag)) for flag in (None, False, True)),
+    ):
         flag = None if certified is None else jnp.asarray(certified)
         state = env.reset_to(_cube(0.0, 0.0).replace(certified=flag))
-        state = state.replace(failed_grasps=jnp.int32(1))
-        assert bool(step(state, action).truncated) == bool(certified)
+        state = state.replace(failed_grasps=jnp.int32(failed))
+        after = jax.jit(env.step)(state, Action.grasp(*BARE))
+        assert (bool(after.truncated), bool(after.terminated)) == (stops, False)
 
 
 def test_oracle_clears_scenes(lab: Lab):

@@ -147,7 +147,7 @@ def test_command_needs_no_mujoco(given: list[str], tmp_path: Path):
     command = [sys.executable, "-c", f"{start}sys.exit(cli.main())", "act", *given, *files]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert " at x " in done.stdout
+    assert " 1 grasp at x " in done.stdout
     command[4] = str(tmp_path)
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)

@@ -164,10 +164,8 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
         stopped = signals.Stop()
         stopped.signal = number
         monkeypatch.setattr(signals, "install", lambda stopped=stopped: stopped)
-        first = (
-            ["smoke", "--seeds", "2", "--run-dir", "run"] if number == 2 else ["--resume", "run"]
-        )
-        assert cli.main(["sweep", *first]) == 128 + number
+        first = "smoke --seeds 2 --run-dir run" if number == 2 else "--resume run"
+        assert cli.main(["sweep", *first.split()]) == 128 + number
         assert "continue with: csac-jax sweep --resume run" in capsys.readouterr().out
     monkeypatch.setattr(signals, "install", signals.Stop)
     assert cli.main(["sweep", "--resume", "run", "--json", "out.json"]) == 0
@@ -175,8 +173,6 @@ def test_exit_codes(capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPat
     result = json.loads(Path("out.json").read_text())
     assert result["complete"]
     assert len(result["compile_seconds"]) == 1
-    assert [row["run_dir"] for row in result["settings"][0]["runs"]] == [
-        "base/seed-0",
-        "base/seed-1",
-    ]
+    runs = [row["run_dir"] for row in result["settings"][0]["runs"]]
+    assert runs == ["base/seed-0", "base/seed-1"]
     assert cli.main(["sweep", "smoke", "--run-dir", "run"]) == 2

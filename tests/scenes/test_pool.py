@@ -219,23 +219,6 @@ def test_poured_piles(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     np.testing.assert_array_equal(again.position, scenes.position)
 
 
-def test_many_blocks_come_to_rest(cache: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: scenes of 24 blocks are found within a few rounds, for they are poured; those of 12
-    drop at once, as fewer always did."""
-    falls: list[tuple] = []
-    for way in ("rest", "pour"):
-        _spy(monkeypatch, pool, way, lambda way, *args: falls.append((way, args[2].in_play.sum())))
-    slots = ("box",) * 24
-    scenes = pool.settled(Config(scene=SceneConfig(slots=slots, min_blocks=24)), 0, 2)
-    assert scenes.in_play.shape == (2, 24)
-    assert scenes.in_play.all()
-    assert set(falls) == {("pour", 24)}
-    assert len(falls) <= 6
-    falls.clear()
-    pool.settled(Config(scene=SceneConfig(slots=slots[:12], min_blocks=12)), 0, 1)
-    assert set(falls) == {("rest", 12)}
-
-
 def test_poured_blocks_that_leave_are_dropped_anew():
     """Claim: where a block of nearly every scene falls outside the workspace, pouring still gives
     the scene."""
