@@ -67,8 +67,10 @@ def commands(page: Path) -> Iterator[list[str]]:
 
 @pytest.fixture
 def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Puts a tiny policy of both tasks in the place of `shipped`."""
-    cfg, path = presets.smoke().change(task={"kind": "both"}), tmp_path / "shipped.safetensors"
+    """Puts a tiny policy of both tasks, which grasps, in the place of `shipped`."""
+    grasps = {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}}
+    cfg = presets.smoke().change(task={"kind": "both"}, **grasps)
+    path = tmp_path / "shipped.safetensors"
     policy_file.save(path, random_params(cfg), cfg)
     monkeypatch.setitem(policy_file.SHIPPED, "shipped", path)
 
@@ -215,11 +217,11 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
 @pytest.mark.usefixtures("shipped")
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Claim: the commands and Python blocks of docs/robot.md run in their order, with a tiny policy
-    for `shipped`."""
+    for `shipped`, and maps of its size for those of `shipped`."""
     for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
-    assert _run_page(ROBOT.read_text()) >= 6
+    assert _run_page(ROBOT.read_text().replace("(96, 96", "(32, 32")) >= 6
     assert Path("demo/decision.png").exists()
 
 
