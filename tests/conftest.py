@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,10 @@ import csac_jax  # noqa: F401  (before JAX: it sets up the thread pool)
 
 import jax  # isort: skip
 
+from csac_jax import presets
+from csac_jax.io import policy_file
+from tests.networks import random_params
+
 gc.set_threshold(100_000, 20, 100)  # to trace makes many objects that live; 700 collects too often
 
 
@@ -38,3 +43,12 @@ def strict_jax(request: pytest.FixtureRequest) -> Iterator[None]:
             if not request.node.get_closest_marker("optax"):
                 stack.enter_context(jax.numpy_dtype_promotion("strict"))
         yield
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Writes a policy that grasps and takes no time, for tests that need any; returns its file."""
+    grasps: Any = {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}}
+    cfg, path = presets.smoke().change(**grasps), tmp_path_factory.mktemp("policies") / "tiny"
+    policy_file.save(path.with_suffix(".safetensors"), random_params(cfg), cfg)
+    return str(path.with_suffix(".safetensors"))

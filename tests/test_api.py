@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import monitor, policies, suites
+from csac_jax.evaluation import monitor
 from csac_jax.io import checkpoint, configs, files, policy_file
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
@@ -29,6 +27,7 @@ from csac_jax.training.callbacks import Record, Summary
 from csac_jax.vision.heightmap import Observation
 from examples.own_learner import QLearner
 from examples.own_network import PlainNet
+from tests.networks import learner_state, random_params
 
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
 
@@ -43,46 +42,9 @@ def test_public_names_exist():
     assert not hasattr(csac_jax, "make_robot")
 
 
-def test_public_objects_have_short_texts():
-    """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
-    cfg, key = SMOKE, jax.random.key(0)
-    env, learned = csac_jax.make_env(cfg), csac_jax.load_policy("shipped_clutter")
-    state = jax.jit(env.reset)(key)
-    arms = [kind(cfg) for kind in policies.BASELINES.values()]
-    objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned, *arms]
-    objects += [
-        csac_jax.deploy.CameraPolicy.load("shipped_clutter"),
-        policies.PlannerPolicy(cfg, learned),
-    ]
-    objects += [learned.debug(state, key), suites.prepare(cfg, "in_distribution", 2)]
-    objects += [api.Run(Path("run"), cfg, SUMMARY, {})]
-    texts = list(map(repr, objects))
-    assert [text for text in texts if len(text) > 400 or "\n" in text] == []
-    params = jax.tree.leaves(learned.params)
-    numbers = sum(leaf.size for leaf in params)
-    named = f"cfg=<fast, csac_beta, seed 1>, params=<{len(params)} arrays, {numbers:,} numbers>"
-    assert repr(learned) == f"NetworkPolicy({named})"
-    assert "reward=0.0, terminated=False" in repr(state)
-
-
-def test_import_leaves_jax_alone():
-    """Claim: `import csac_jax` loads neither JAX nor MuJoCo, and `--help` neither."""
-    loaded = "import sys; print({'jax', 'mujoco', 'flax'} & set(sys.modules))"
-    for code in ("import csac_jax", "from csac_jax import cli; cli.main(['--help'])"):
-        command = [sys.executable, "-c", f"{code}; {loaded}"]
-        assert subprocess.check_output(command, text=True).strip().endswith("set()")
-
-
-def _learner_state(cfg: Config, seed: int = 0) -> LearnerState:
-    parts = actor_critic.make(cfg)
-    return jax.jit(lambda: actor_critic.init(jax.random.key(seed), parts))()
-
-
 def _policy(path: Path, cfg: Config) -> Params:
     """Networks that no seed gives, saved as a policy file."""
-    rng = np.random.default_rng(0)
-    blank = actor_critic.abstract_params(cfg)
-    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
+    params = random_params(cfg, 7)
     policy_file.save(path, params, cfg)
     return params
 
@@ -107,43 +69,6 @@ def _assert_starts_from(state: LearnerState, params: Params, fresh: LearnerState
     assert int(state.updates) == 0
 
 
-@pytest.mark.parametrize("seeds", [None, 3])
-def test_first_states_have_the_networks_of_the_policy(tmp_path: Path, seeds: int | None):
-    """Claim: `init` puts a policy's networks into online and target ones of a run, or of each run
-    of a sweep, whose states have an axis of runs; the optimisers are those of a fresh run."""
-    params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    start: Any = api.initial_networks(SMOKE, tmp_path / "policy.safetensors")
-    assert api.initial_networks(SMOKE, None) is None
-    states = [_learner_state(SMOKE, seed) for seed in range(seeds or 1)]
-    if seeds is None:
-        _assert_starts_from(start(states[0]), params, states[0])
-        return
-    started = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
-    for k, fresh in enumerate(states):
-        _assert_starts_from(jax.tree.map(lambda leaf, k=k: leaf[k], started), params, fresh)
-
-
-def test_target_task_starts_from_a_policy_without_targets(tmp_path: Path):
-    """Claim: networks of the task `clear` start the task `target`; until they learn, their maps
-    are the same, whatever is the target."""
-    params = _policy(tmp_path / "policy.safetensors", SMOKE)
-    target = SMOKE.change(task={"kind": "target"})
-    start = api.initial_networks(target, tmp_path / "policy.safetensors")
-    assert start is not None
-    state = start(_learner_state(target))
-    rows = (3, SMOKE.heightmap.size, SMOKE.heightmap.size)
-    rng = np.random.default_rng(1)
-    colour, height = rng.uniform(size=(*rows, 3)), 0.1 * rng.uniform(size=rows)
-    mask = rng.uniform(size=rows) < np.array([0.0, 0.5, 1.0])[:, None, None]
-    obs = Observation(jnp.float32(colour), jnp.float32(height), jnp.array(mask))
-    found, wanted = (
-        jax.jit(functools.partial(values.dense_maps, actor_critic.make(cfg)))(networks, obs)
-        for cfg, networks in ((target, state.online), (SMOKE, params))
-    )
-    np.testing.assert_allclose(found.q, wanted.q, rtol=1e-5, atol=1e-5)
-    _assert_same(state.target, state.online)
-
-
 def test_task_without_targets_starts_from_a_policy_that_sees_them(tmp_path: Path):
     """Claim: a net that knows both tasks starts the task `clear`, whose net then sees the mask too;
     with all marked, the maps and valid cells are the same."""
@@ -154,7 +79,7 @@ def test_task_without_targets_starts_from_a_policy_that_sees_them(tmp_path: Path
     assert not api.match_networks(both, path).net.mask
     start = api.initial_networks(cfg, path)
     assert start is not None
-    state, rows = start(_learner_state(cfg)), (1, SMOKE.heightmap.size, SMOKE.heightmap.size)
+    state, rows = start(learner_state(cfg)), (1, SMOKE.heightmap.size, SMOKE.heightmap.size)
     obs = Observation(jnp.ones((*rows, 3)), jnp.full(rows, 0.05), jnp.ones(rows, bool))
     found, wanted = (
         jax.jit(functools.partial(values.dense_maps, actor_critic.make(one)))(networks, obs)
@@ -196,7 +121,7 @@ def test_networks_of_a_policy_can_be_asked_for(tmp_path: Path):
     params = _policy(path, given)
     cfg = api.match_networks(SMOKE, path)
     assert cfg == SMOKE.change(net={"growth": 8}, learn={"critics": 2})
-    start, fresh = api.initial_networks(cfg, path), _learner_state(cfg)
+    start, fresh = api.initial_networks(cfg, path), learner_state(cfg)
     assert start is not None
     _assert_starts_from(start(fresh), params, fresh)
 
@@ -218,12 +143,19 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[api.Run, list[Rec
 @pytest.mark.optax
 def test_run_is_complete(trained, capsys: pytest.CaptureFixture):
     """Claim: a run returns its folder, config and summary; each chunk's record reaches the
-    callbacks."""
+    callbacks. Its own record is that of the command: its end, wall time, config, device, versions
+    and commit."""
     run, records = trained
     assert (run.cfg, run.summary.actions, run.summary.stopped_by) == (SMOKE, 64, None)
     assert [record.actions for record in records] == [8 * n for n in range(1, 9)]
     assert capsys.readouterr().out == ""
     assert configs.load_config(run.run_dir / "config.json") == run.cfg
+    record = files.read_object(run.run_dir / files.RECORD)
+    assert record["run_dir"] == str(run.run_dir)
+    assert record["wall_seconds"] >= record["seconds"]
+    assert configs.from_dict(record["config"]) == run.cfg
+    for known in (run.summary._asdict(), provenance.record()):
+        assert {name: record[name] for name in known} == known
 
 
 @pytest.mark.slow
@@ -309,20 +241,6 @@ def test_run_names_its_own_parts(tmp_path: Path, capsys: pytest.CaptureFixture):
     assert f"these settings are of a run with {name}, none is given" in line
 
 
-@pytest.mark.mjx
-@pytest.mark.optax
-def test_run_has_a_record(trained):
-    """Claim: a run of the API has the record that the command's has: its end, wall time, config,
-    device, versions and commit."""
-    run, _ = trained
-    record = files.read_object(run.run_dir / files.RECORD)
-    assert record["run_dir"] == str(run.run_dir)
-    assert record["wall_seconds"] >= record["seconds"]
-    assert configs.from_dict(record["config"]) == run.cfg
-    for known in (run.summary._asdict(), provenance.record()):
-        assert {name: record[name] for name in known} == known
-
-
 @pytest.mark.slow
 @pytest.mark.mjx
 @pytest.mark.optax
@@ -391,25 +309,11 @@ def test_sweep_has_every_combination(sweeps: list[Any], capsys: pytest.CaptureFi
         assert point.cfg == wanted.change(learn={"tau": tau}, replay={"capacity": 128})
 
 
-def test_sweep_decides_on_physics(sweeps: list[Any], monkeypatch: pytest.MonkeyPatch):
-    """Claim: `auto` is resolved for all runs together before they are planned."""
-    asked = []
-
-    def resolve(cfg: Config, devices: int, runs: int) -> Config:
-        asked.append((devices, runs))
-        return cfg.change(sim={"physics": "c"})
-
-    monkeypatch.setattr(api.backend, "resolve", resolve)
-    api.sweep(presets.quick(), 3, {"learn.tau": (0.1, 0.2)}, verbose=False)
-    ((plan, *_),) = sweeps
-    assert asked == [(1, 6)] * 2
-    assert {point.cfg.sim.physics for point in plan.points} == {"c"}
-
-
 @pytest.mark.mjx
 def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, monkeypatch):
-    """Claim: `init` is where each run of a sweep starts from, the learners of all groups; parts of
-    one's own are in every group's program."""
+    """Claim: `init` puts a policy's networks into online and target ones of each run of a sweep,
+    whose states have an axis of runs, in all groups; the optimisers are those of a fresh run. Parts
+    of one's own are in every group's program."""
     mine = Newest()
     params = _policy(tmp_path / "policy.safetensors", SMOKE)
     given = []
@@ -422,21 +326,8 @@ def test_runs_of_a_sweep_start_from_a_policy(sweeps: list[Any], tmp_path: Path, 
     ((asked, mesh, shard, start, own),) = given
     assert (asked, mesh, shard, own) == (group, None, "seeds", own_parts.OwnParts(mine))
     assert made(group, own=own).program.sampler is mine
-    _assert_same(start(_learner_state(SMOKE)).online, params)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"vary": {"seed": (1, 2)}}, r"leave seed out"),
-        ({"vary": {"learn.tau": (2.0,)}}, r"^learn\.tau: must be at most 1"),
-        ({"vary": {"algo": ("dqn",)}}, r"unknown algorithm 'dqn'"),
-        ({"devices": 10_000}, r"devices: 10000 asked for"),
-    ],
-)
-def test_sweep_refuses_what_cannot_be(sweeps: list[Any], arguments: dict[str, Any], message: str):
-    """Claim: a sweep that cannot be is a ValueError of one line, before anything starts."""
-    with pytest.raises(ValueError, match=message) as caught:
-        api.sweep(SMOKE, **arguments, verbose=False)
-    assert "\n" not in str(caught.value)
-    assert sweeps == []
+    states = [learner_state(SMOKE, seed) for seed in range(3)]
+    started = start(jax.tree.map(lambda *leaves: jnp.stack(leaves), *states))
+    for k, fresh in enumerate(states):
+        _assert_starts_from(jax.tree.map(lambda leaf, k=k: leaf[k], started), params, fresh)
+    assert api.initial_networks(SMOKE, None) is None

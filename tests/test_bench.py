@@ -37,16 +37,6 @@ def test_service_that_does_not_start_says_why(monkeypatch: pytest.MonkeyPatch):
         serve.measure(1, 9)
 
 
-def test_page_shows_figures_and_failures():
-    """Claim: the page of `make bench` has the main figures of a result, or why there is none."""
-    rates = [{"actions_per_second": rate} for rate in (1.25, 3.0)]
-    shown = [row["value"] for row in page.rows("sweep", {"rows": rates, "wall_seconds": 2})]
-    assert shown == ["1.25", "3", "2"]
-    (row,) = page.rows("sweep", {"failed": "no room", "wall_seconds": 2})
-    assert row == {"benchmark": "sweep", "figure": "failed", "value": "no room"}
-    assert page.FIGURES.keys() == page.MAIN.keys()
-
-
 def test_page_reads_what_benchmarks_write():
     """Claim: the main figures of the page are those of a recorded result of each benchmark."""
     for name, places in page.FIGURES.items():

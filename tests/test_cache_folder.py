@@ -54,10 +54,3 @@ def test_user_without_a_home_caches_nothing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pathlib.Path, "home", mock.Mock(side_effect=RuntimeError("no home")))
     assert cache_folder.private("pools") is None
     assert cache._folder() is None
-
-
-def test_file_in_the_way(home: Path):
-    """Claim: a file in the place of the folder switches the cache off."""
-    home.mkdir()
-    (home / "csac_jax").touch()
-    assert cache_folder.private("pools") is None

@@ -22,8 +22,9 @@ import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import parsing, sweep
 from csac_jax.evaluation import suites
-from csac_jax.io import checkpoint, configs
+from csac_jax.io import checkpoint, configs, policy_file
 from experiments import index
+from tests.networks import random_params
 
 ROOT = Path(csac_jax.__file__).parents[1]
 README, DOCS = ROOT / "README.md", ROOT / "docs"
@@ -64,12 +65,24 @@ def commands(page: Path) -> Iterator[list[str]]:
             yield words[1:] if words[0] == "srun" else words
 
 
+@pytest.fixture
+def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Puts a tiny policy of both tasks, which grasps, in the place of `shipped`."""
+    grasps = {"policy": {"primitive": "grasp"}, "explore": {"push_fraction": 0.0}}
+    cfg = presets.smoke().change(task={"kind": "both"}, **grasps)
+    path = tmp_path / "shipped.safetensors"
+    policy_file.save(path, random_params(cfg), cfg)
+    monkeypatch.setitem(policy_file.SHIPPED, "shipped", path)
+
+
 @pytest.mark.mjx
 @pytest.mark.optax
+@pytest.mark.usefixtures("shipped")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the blocks of a page run, one after the other, with a small preset for `quick`, few
-    episodes and few seeds, in a folder with a recorded run; `train_fn` is traced alone."""
+    """Claim: the blocks of a page run, one after the other, with a small preset for `quick` and a
+    tiny policy for `shipped`, few episodes and few seeds, in a folder with a recorded run;
+    `train_fn` is traced alone."""
     monkeypatch.chdir(tmp_path)
     matplotlib.use("Agg")
     (tmp_path / "runs" / "first").mkdir(parents=True)
@@ -201,12 +214,14 @@ def _run_page(text: str, text_blocks: bool = False) -> int:
     return len(steps)
 
 
+@pytest.mark.usefixtures("shipped")
 def test_robot_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Claim: the commands and Python blocks of docs/robot.md run in their order."""
+    """Claim: the commands and Python blocks of docs/robot.md run in their order, with a tiny policy
+    for `shipped`, and maps of its size for those of `shipped`."""
     for module in ("jax2onnx", "onnxruntime"):
         pytest.importorskip(module)
     monkeypatch.chdir(tmp_path)
-    assert _run_page(ROBOT.read_text()) >= 6
+    assert _run_page(ROBOT.read_text().replace("(96, 96", "(32, 32")) >= 6
     assert Path("demo/decision.png").exists()
 
 

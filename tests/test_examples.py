@@ -1,8 +1,6 @@
 """Every file of examples/ runs, and is short."""
 
 import importlib
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -53,15 +51,6 @@ def test_own_parts_train(small: str, name: str, tmp_path: Path):
     assert (run.summary.actions, run.summary.stopped_by) == (64, None)
     table = csac_jax.evaluate(run.policy, suite="in_distribution", episodes=2)
     assert table["counts"]["episodes"] == 2
-
-
-@pytest.mark.parametrize(("arguments", "code"), [(["--help"], 0), ([], 1)])
-def test_camera_image_explains_itself(arguments: list[str], code: int, tmp_path: Path):
-    """Claim: `camera_image.py --help`, or without a folder, prints its use and makes no folder."""
-    command = [sys.executable, str(FOLDER / "camera_image.py"), *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode, list(tmp_path.iterdir())) == (code, [])
-    assert "python examples/camera_image.py demo" in done.stdout
 
 
 def test_random_agent_runs(small: str):

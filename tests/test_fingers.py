@@ -2,8 +2,6 @@
 
 import dataclasses
 import functools
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +13,9 @@ import pytest
 
 from csac_jax import api, deploy, grippers, presets
 from csac_jax.agent import actor_critic, values
-from csac_jax.agent.actor_critic import Params
 from csac_jax.baselines import oracle
 from csac_jax.cli import main
-from csac_jax.config import Config, PhysicsKind
+from csac_jax.config import PhysicsKind
 from csac_jax.env import Env, State, make_env
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Fingers
@@ -28,12 +25,12 @@ from csac_jax.robot.primitives import Action
 from csac_jax.vision import heightmap
 from csac_jax.world import model, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.networks import learner_state, random_params
 from tests.world import placed
 
 CONFIG = presets.smoke().change(sim={"physics": "c", "gripper": "varied"}, net={"gripper": True})
 VARIED = grippers.load("varied")
 ASKED = "gripper: name the robot's, one of 2f85, franka_hand, rg2"
-RANGES = {"opening": [0.06, 0.14], "thickness": [0.008, 0.02], "width": [0.014, 0.026]}
 THIN = Fingers(0.08, 0.009, 0.015)  # m
 
 
@@ -47,11 +44,6 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Env:
 @pytest.fixture(scope="module")
 def states(env: Env) -> State:
     return jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 64))
-
-
-def _networks(cfg: Config) -> Params:
-    learner = actor_critic.make(cfg)
-    return jax.jit(lambda key: actor_critic.init(key, learner).online)(jax.random.key(1))
 
 
 def _scene(fingers: Fingers = THIN) -> SceneState:
@@ -100,23 +92,6 @@ def test_fingers_stay_for_the_episode(env: Env, states: State):
     given = env.reset_to(first.scene.replace(fingers=None))
     np.testing.assert_allclose(given.scene.fingers, VARIED.fingers, rtol=1e-6)
     np.testing.assert_array_equal(env.reset_to(first.scene).scene.fingers, first.scene.fingers)
-
-
-@pytest.mark.parametrize(
-    ("varies", "line"),
-    [
-        ({}, "'varies.opening' is missing"),
-        ({"opening": 0.1}, "'varies.opening' should be a valid array"),
-        (RANGES | {"opening": [0.14, 0.06]}, "'varies' must be ranges [least, most] above 0"),
-        (RANGES | {"width": [0.01, 0.03]}, "the most of 'varies' must be the MJCF's"),
-    ],
-)
-def test_wrong_ranges_are_one_line(tmp_path: Path, varies: Any, line: str):
-    """Claim: a gripper.json whose ranges are none is refused by what is wrong with them."""
-    numbers = json.loads((VARIED.folder / grippers.NUMBERS).read_text())
-    (tmp_path / grippers.NUMBERS).write_text(json.dumps(numbers | {"varies": varies}))
-    with pytest.raises(SettingsError, match=re.escape(f"{grippers.NUMBERS}: {line}")):
-        grippers.load(str(tmp_path))
 
 
 @pytest.mark.parametrize("fingers", [THIN, VARIED.fingers, VARIED.varies[0]])
@@ -195,7 +170,7 @@ def test_oracle_takes_what_fits(env: Env):
 
 def test_net_sees_the_fingers(states: State):
     """Claim: Q follows the fingers, which a stored observation keeps."""
-    learner, params = actor_critic.make(CONFIG), _networks(CONFIG)
+    learner, params = actor_critic.make(CONFIG), random_params(CONFIG)
     look = jax.jit(functools.partial(values.dense_maps, learner, params))
     obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
     same = obs.replace(fingers=obs.fingers[:1].repeat(2, axis=0))
@@ -207,23 +182,22 @@ def test_net_sees_the_fingers(states: State):
 
 def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State):
     """Claim: networks without the last inputs, gripper, target and how the hand fits, are a start:
-    Q is the same for all fingers, and the nets still see the gripper. Those that lack another input
-    are refused."""
+    Q is the same for all fingers and targets, and the nets still see the gripper. Those that lack
+    another input are refused."""
     blind = presets.smoke().change(sim={"physics": "c"})
-    params, path = _networks(blind), tmp_path / "policy.safetensors"
+    params, path = random_params(blind), tmp_path / "policy.safetensors"
     policy_file.save(path, params, blind)
     changes: Any = {"task": {"kind": "target"}}, {"net": {"fit": True}}
     for cfg in (CONFIG, *(CONFIG.change(**one) for one in changes)):
         start: Any = api.initial_networks(cfg, path)
-        learner = actor_critic.make(cfg)
-        fresh = jax.jit(lambda key, learner=learner: actor_critic.init(key, learner))
-        found = start(fresh(jax.random.key(3))).online
-        obs = jax.tree.map(lambda leaf: leaf[:2], states.obs)
+        found = start(learner_state(cfg, 3)).online
+        target = np.random.default_rng(1).uniform(size=states.obs.target[:2].shape) < 0.5
+        obs = jax.tree.map(lambda leaf: leaf[:2], states.obs).replace(target=target)
         seen, both = (
             jax.jit(functools.partial(values.dense_maps, learner))(params, obs)
             for learner, params, obs in (
                 (actor_critic.make(blind), params, obs.replace(fingers=None)),
-                (learner, found, obs),
+                (actor_critic.make(cfg), found, obs),
             )
         )
         np.testing.assert_allclose(both.q, seen.q, atol=1e-5)
@@ -232,7 +206,7 @@ def test_start_from_a_policy_that_sees_no_gripper(tmp_path: Path, states: State)
     assert found.fit
     for changes in ({"task": {"kind": "target"}}, {"net": {"colour": False}}):
         other = blind.change(**changes)
-        policy_file.save(path, _networks(other), other)
+        policy_file.save(path, random_params(other), other)
         with pytest.raises(SettingsError, match="its networks are not those of these settings"):
             api.initial_networks(CONFIG.change(task={"kind": "target"}), path)
 
@@ -242,11 +216,10 @@ def test_robot_has_one_gripper(tmp_path: Path, capsys: pytest.CaptureFixture[str
     """Claim: a policy for any gripper is exported as it is; a program, or a decision for a robot,
     asks for its gripper in one line."""
     path, program_file = tmp_path / "policy.safetensors", tmp_path / "program.onnx"
-    policy_file.save(path, _networks(CONFIG), CONFIG)
+    policy_file.save(path, random_params(CONFIG), CONFIG)
     assert main(["export", str(path), str(tmp_path / "copy.safetensors")]) == 0
     with pytest.raises(SettingsError, match=f"^{ASKED}"):
         deploy.CameraPolicy.load(path).warm_up(64, 48)
-    deploy.CameraPolicy.load(path, gripper="2f85").warm_up(64, 48)
     given = ["export", str(path), str(program_file), "--format", "onnx"]
     capsys.readouterr()
     assert main(given) == 2

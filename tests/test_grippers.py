@@ -52,23 +52,7 @@ def test_gap_is_the_inverse_of_the_joints(name: str, xp: Any):
         np.testing.assert_array_equal(values, half)
 
 
-def test_arc_is_a_circle():
-    """Claim: pads of a linkage move on a circle of its radius, by both ends of its depth."""
-    gripper = grippers.load("2f85")
-    half = np.linspace(*gripper.half, 9)
-    drop = gripper.drop(half)
-    assert drop[0] == pytest.approx(gripper.depth[0] - gripper.depth[1])
-    assert drop[-1] == pytest.approx(0.0, abs=1e-12)
-    # Two circles of a radius pass through both ends; the centre of this one is towards the flange.
-    a, b = np.array([half[0], -drop[0]]), np.array([half[-1], -drop[-1]])
-    middle, chord = 0.5 * (a + b), b - a
-    normal = np.array([-chord[1], chord[0]]) / np.linalg.norm(chord)
-    away = np.sqrt(gripper.arc_radius**2 - 0.25 * (chord @ chord))
-    centre = middle + away * normal
-    radii = np.hypot(half - centre[0], -drop - centre[1])
-    np.testing.assert_allclose(radii, gripper.arc_radius, atol=1e-9)
-
-
+RANGES = {"opening": [0.06, 0.14], "thickness": [0.008, 0.02], "width": [0.014, 0.026]}
 WRONG = {
     "missing": (("opening", None), "'opening' is missing"),
     "part": (("finger", {"thickness": 0.01, "width": 0.02}), "'finger.length' is missing"),
@@ -84,6 +68,10 @@ WRONG = {
     "still": (("joints", {"a": {"closed": 1, "open": 1}}), "must differ between closed and open"),
     "narrow": (("radius", 0.05), "'radius' must hold the open fingers"),
     "tight": (("arc_radius", 0.02), "'arc_radius' must be above 0.0275"),
+    "no range": (("varies", {}), "'varies.opening' is missing"),
+    "a number": (("varies", {"opening": 0.1}), "'varies.opening' should be a valid array"),
+    "turned": (("varies", RANGES | {"opening": [0.14, 0.06]}), "'varies' must be ranges [least, "),
+    "wider": (("varies", RANGES | {"width": [0.01, 0.03]}), "the most of 'varies' must be the MJ"),
 }
 
 
@@ -91,7 +79,7 @@ WRONG = {
 def test_numbers_that_do_not_fit_are_named(tmp_path: Path, case: str):
     """Claim: numbers that are missing, unknown or cannot be are one line with file and key."""
     (key, value), says = WRONG[case]
-    numbers = _numbers()
+    numbers = _numbers("varied" if key == "varies" else "rg2")
     numbers[key] = value
     if value is None:
         del numbers[key]

@@ -10,8 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 import csac_jax
 
 PACKAGE = Path(csac_jax.__file__).parent
@@ -214,36 +212,6 @@ def test_training_in_c_needs_no_mjx():
     subprocess.run([sys.executable, "-c", code], check=True, env=variables)
 
 
-@pytest.mark.parametrize(
-    ("file", "source", "fault"),
-    [
-        ("vision/a.py", "from csac_jax.training import loop", "training is imported"),
-        ("vision/a.py", "def f():\n    import csac_jax.env", "env is imported"),
-        ("render/a.py", "import tyro", "tyro is imported"),
-        ("training/a.py", "from . import loop", "relative import"),
-        ("agent/a.py", "from mujoco import mjx", "mujoco is imported"),
-        ("agent/a.py", "from flax import linen as nn", "flax.linen is imported"),
-        ("agent/a.py", "import flax\nx = flax.linen.Dense", "flax.linen is used"),
-        ("agent/a.py", "import jax\n@jax.jit\ndef f(x): return x", "jax.jit is used"),
-        ("world/a.py", "from jax import jit\nf = jit(abs)", "jax.jit is used"),
-        ("nets/a.py", "import jax\njax.debug.print('x')", "jax.debug.print is used"),
-        ("replay/a.py", "open('x')", "open is used"),
-        ("vision/a.py", "from pathlib import Path", "pathlib is imported"),
-        ("__init__.py", "from csac_jax import api", "api is imported"),
-        ("__init__.py", "if not TYPE_CHECKING:\n    import csac_jax.env", "env is imported"),
-        ("nets/a.py", "if TYPE_CHECKING:\n    from csac_jax import env", "env is imported"),
-        ("extra/a.py", "", "stage 'extra' has no place"),
-    ],
-)
-def test_checker_sees_a_breach(tmp_path: Path, file: str, source: str, fault: str):
-    """Claim: each rule of the contract can fail."""
-    path = tmp_path / file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(source)
-    (found,) = violations(tmp_path)
-    assert fault in found
-
-
 FORBIDDEN = ("pickle", "marshal", "shelve", "dill", "yaml", "eval", "exec", "os.system", "os.popen")
 HARMLESS = ("yaml", "yaml.scan", "yaml.AliasToken", "yaml.safe_load", "yaml.YAMLError")
 HARMLESS += ("yaml.safe_dump",)
@@ -272,22 +240,3 @@ def test_nothing_is_executed():
     every = {path: dangers(path.read_text()) for path in PACKAGE.rglob("*.py")}
     assert len(every) > 100
     assert not {path: found for path, found in every.items() if found}
-
-
-@pytest.mark.parametrize(
-    "source",
-    [
-        "from pickle import loads",
-        "import yaml as y\ny.load(f)",
-        "from yaml import load",
-        "x = exec",
-        "from os import system\nsystem('ls')",
-        "import subprocess\nsubprocess.run('ls', shell=x)",
-        "import numpy as np\nnp.load(f, allow_pickle=True)",
-    ],
-)
-def test_dangers_are_found(source: str):
-    """Claim: the test above can fail."""
-    assert dangers(source)
-    assert not dangers("import yaml\nyaml.safe_load(f)")
-    assert not dangers("import subprocess, re\nsubprocess.run(['ls'], shell=False)\nre.compile('')")

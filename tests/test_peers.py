@@ -128,15 +128,6 @@ def test_decisions_arrive_where_the_image_shows_the_object(view: View, noise: fl
         assert width == pytest.approx(0.08)
 
 
-def test_a_fitted_hand_is_centred_and_as_wide_as_the_object():
-    """Claim: a fitted hand is centred to 4 mm, open 10 mm beside a box of 40 mm, to a cell
-    of 7 mm on both sides."""
-    _, sim = _play("geometric", opening="fit")
-    for tips, _, _, width in sim.grasps:
-        assert abs(tips[1]) < 0.004
-        assert 0.06 <= width <= 0.077
-
-
 def test_random_is_worse_and_rounds_do_not_depend_on_the_policy():
     """Claim: a round ends with the second failure in a row; each policy meets the same box."""
     rounds, sim = _play("random")

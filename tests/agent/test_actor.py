@@ -125,14 +125,3 @@ def test_yaw_does_not_turn_to_what_is_not_valid(frames, pose, logits, valid, sid
     got = pose(logits, valid)
     assert_allclose(got, pose(logits, away), atol=1e-5)
     assert (got[2] - frames.yaws[2]) * side < 0.0  # the only other yaw is on the other side
-
-
-def test_neighbours_do_not_leak_into_the_yaw(frames, pose, logits, valid):
-    """Claim: an invalid cell next to the one read in the neighbouring yaw does not count."""
-    best = (2, 8, 10)  # in the next frame its place is 0.2 of a cell from the nearest centre
-    logits[best] = 1.0
-    distance = np.linalg.norm(frames.xy[3] - frames.xy[best], axis=-1)
-    row, col = np.unravel_index(np.argsort(distance, axis=None)[1], distance.shape)
-    before = pose(logits, valid)
-    valid[3, row, col], logits[3, row, col] = False, 19.0  # it has a share in what is read
-    assert_allclose(pose(logits, valid), before, atol=1e-3)

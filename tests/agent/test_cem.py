@@ -90,13 +90,6 @@ def test_search_goes_on_where_no_score_was_found():
     assert np.mean(result.value == 1.0) > 0.8
 
 
-def test_start_must_fit():
-    """Claim: more starting points than candidates is an error that names the setting."""
-    cfg, key = CEMConfig(candidates=8), jax.random.key(0)
-    with pytest.raises(ValueError, match=r"cem\.candidates"):
-        cem.maximise(key, cfg, jnp.sum, jnp.zeros(3), jnp.zeros((9, 3)))
-
-
 @pytest.mark.parametrize(
     ("values", "valid", "mean", "yaw", "std"),
     [((0.1, 0.2, 0.6), 3, 0.3, 0.3, np.sqrt(0.14 / 3)),
@@ -110,13 +103,3 @@ def test_fit_by_hand(values, valid, mean, yaw, std):
     got_mean, got_std = cem.fit(CEMConfig(), elites, jnp.arange(3) < valid)
     assert_allclose([*got_mean[:2], abs(got_mean[2])], [mean, mean, yaw], atol=1e-6)
     assert_allclose(got_std[2], std, rtol=1e-5)
-
-
-def test_wrap():
-    """Claim: wrapping moves by whole turns into [-1, 1), never to 1 itself, from just below the
-    seam either; of a pose (x, y, yaw), yaw alone wraps."""
-    below = np.nextafter(np.float32(-1.0), np.float32(-2.0))
-    u = jnp.array([-3.2, -1.0, -0.5, 0.0, 0.99, 1.0, 1.5, 7.25, below])
-    assert_allclose(box.wrap(u), [0.8, -1.0, -0.5, 0.0, 0.99, -1.0, -0.5, -0.75, 1.0], atol=1e-6)
-    assert np.all(box.wrap(u) < 1.0)
-    assert box.POSE_WRAPS.tolist() == [False, False, True]

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 from scipy import stats
 
 from csac_jax.agent import explore
@@ -56,15 +55,6 @@ def test_pose_belongs_to_the_primitive():
     assert np.all(at_greedy ^ at_random)
     assert 0.4 < at_greedy.mean() < 0.6
     assert set(primitives) == {0, 1}
-
-
-def test_no_exploration_is_greedy():
-    """Claim: with all probabilities and the noise at 0, the greedy action is taken as it is."""
-    cfg = ExploreConfig(epsilon_primitive=(0.0, 0.0), epsilon_place=(0.0, 0.0), noise_std=0.0)
-    for primitive in (0, 1):
-        primitives, poses = choices(cfg, 0, primitive)
-        assert np.all(primitives == primitive)
-        assert_allclose(poses, np.tile(GREEDY_POSES[primitive], (NUM, 1)), atol=1e-6)
 
 
 def test_action_noise_is_a_clipped_normal():

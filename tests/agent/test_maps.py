@@ -1,7 +1,6 @@
 """Dense maps: where their cells lie, and reading them at an action."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -196,23 +195,3 @@ def test_net_sees_how_the_hand_fits(cfg):
     assert not after[:, 0, 0, -4:].any()
     some = maps.rotated_inputs(frames[1], obs, jnp.array([2, 0]))
     assert_array_equal(some, after[np.array([2, 0])])
-
-
-def test_normalise_is_inverse(frames):
-    """Claim: pose to box and back is the same pose, with the yaw in [0, 2 pi)."""
-    poses = jnp.asarray(_poses(100), jnp.float32)
-    box = jax.vmap(lambda pose: maps.normalise(frames, pose))(poses)
-    assert np.all(np.abs(box) <= 1.0)
-    assert_allclose(jax.vmap(lambda u: maps.denormalise(frames, u))(box), poses, atol=2e-6)
-
-
-def test_best_over_yaws(frames):
-    """Claim: a place has the largest valid value of its yaws, by primitive, else -inf."""
-    q, valid = np.zeros(frames.reachable.shape, np.float32), np.zeros(frames.reachable.shape, bool)
-    q[PUSH, 3, 9, 6], q[PUSH, 1, 9, 9], q[GRASP, 3, 9, 6] = 1.0, 7.0, 0.5
-    valid[PUSH, 3, 9, 6] = valid[GRASP, 3, 9, 6] = True
-    state = maps.DenseMaps(jnp.asarray(q), jnp.asarray(q), jnp.asarray(valid))
-    places = jnp.asarray(np.stack([frames.xy[3, 9, 6], frames.xy[1, 9, 9]]).reshape(2, 1, 2))
-    best = jax.jit(functools.partial(maps.best_over_yaws, frames))(state, places)
-    assert_allclose(best[:, 0, 0], [1.0, 0.5], atol=1e-5)
-    assert np.all(np.isneginf(best[:, 1, 0]))

@@ -12,7 +12,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from csac_jax.agent.learner import Learner, UpdateInfo
 from csac_jax.constants import Primitive
 from csac_jax.nets import dense
-from csac_jax.replay import ring
 from csac_jax.replay.samplers import Sample, Sampler
 from csac_jax.robot.primitives import Action
 from csac_jax.training import programs, step, transitions
@@ -70,23 +69,6 @@ def _trained(**parts) -> tuple[Any, step.TrainState, transitions.StepMetrics]:
     first = programs.init(program)
     learner = jax.tree.map(jnp.copy, first.learner)
     return learner, *programs.compile_chunk(program, STEPS)(first)
-
-
-def test_sampler_needs_sample_alone():
-    """Claim: a sampler with nothing but `sample` has priorities of 0 at first and keeps the size of
-    each error; a sampler without it is none."""
-    sampler = Newest()
-    state = ring.init(sampler.init(4), jnp.int32(0))
-    assert_array_equal(state.priority, np.zeros(4, np.float32))
-    state = ring.add(state, jnp.arange(3), jnp.ones(3, bool))
-    slots, weights = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), 2)
-    assert_array_equal(slots, [2, 2])
-    state = sampler.update(state, jnp.array([0, 2]), jnp.array([0.25, -3.0]))
-    assert_array_equal(state.priority, [0.25, 1.0, 3.0, 0.0])
-    assert sampler.replace_hyperparams(CFG.replay) is sampler
-    assert weights.shape == (2,)
-    with pytest.raises(TypeError, match="sample"):
-        type("Nothing", (Sampler,), {})()
 
 
 def test_learner_and_sampler_of_ones_own():

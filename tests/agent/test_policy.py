@@ -200,18 +200,3 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
         for options in (compiler.SOONER, {name: own[name] for name in compiler.SOONER})
     )
     assert_allclose(sooner, by_default, rtol=0.0, atol=1e-5)
-
-
-@pytest.mark.slow
-def test_candidates_are_those_of_the_search(cfg, frames, parts):
-    """Claim: with one round, the greedy pose of each primitive is one of `candidates` for the same
-    key; VPG's only candidate is the best pixel."""
-    one = parts(cfg.change(cem={"rounds": 1, "start": "actor"}))
-    vpg, state, key = parts(algorithms.configure(cfg, "vpg")), _state(frames, 0), jax.random.key(3)
-    for own, num in ((one, cfg.cem.candidates), (vpg, 1)):
-        tried = jax.jit(lambda key, own=own: policy.candidates(key, own, state))(key)
-        assert tried.shape == (2, num, 3)
-        greedy = jax.jit(lambda key, own=own: policy.greedy(key, own, state, jnp.int32(0)).poses)
-        for poses, u in zip(np.asarray(tried), greedy(key), strict=True):
-            pose = np.asarray(maps.denormalise(frames, u))
-            assert np.abs(poses - pose[None]).max(axis=1).min() < 1e-5

@@ -57,12 +57,6 @@ def test_a_rise_by_the_dead_band_is_no_gain():
     assert_array_equal(rewards.gains_value(CFG, jnp.zeros(2), after), [False, True])
 
 
-@pytest.mark.parametrize("outcome", Outcome)
-def test_push_ignores_the_outcome_of_a_grasp(outcome):
-    """Claim: a push earns no reach reward and no grasp level, whatever is in `outcome`."""
-    assert reward(CFG, Primitive.PUSH, outcome, after=1.0) == 0.5
-
-
 def test_distance_is_a_loss():
     """Claim: r = r2 - w r1: 0.2 m at w = 2 cost 0.4, of a push and of a grasp, and beyond 1 m no
     more than at 1 m."""
@@ -108,14 +102,6 @@ def test_blocks_that_left_cost_once(primitive):
     for cfg, lost, penalty in ((strict, 0, 0.0), (strict, 1, 0.75), (strict, 3, 0.75), (CFG, 2, 0)):
         got = reward(cfg, primitive, Outcome.LIFTED, after=1.0, blocks_lost=lost)
         assert got == reward(CFG, primitive, Outcome.LIFTED, after=1.0) - penalty
-
-
-def test_scale():
-    """Claim: eq. 13 by hand: eta0 + eta1 2^(s - s_max)."""
-    assert rewards.scale(CFG, CFG.push_level) == 0.5
-    assert rewards.scale(CFG, CFG.grasp_level) == 1.0
-    other = with_constants(RewardConfig(), eta=(0.25, 3.0), grasp_level=2.0)
-    assert rewards.scale(other, 0.0) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic
 from csac_jax.baselines import planner, trials
 from csac_jax.constants import Primitive
 from csac_jax.env import Env, State
@@ -17,6 +16,7 @@ from csac_jax.evaluation.policies import NetworkPolicy, PlannerPolicy, RandomPol
 from csac_jax.robot.primitives import Action
 from csac_jax.world import scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.networks import random_params
 
 pytestmark = pytest.mark.mjx
 
@@ -132,18 +132,10 @@ def test_key_decides():
     np.testing.assert_array_equal(both.pose, [one.pose, other.pose])
 
 
-def test_planner_needs_the_state():
-    """Claim: an observation is refused, in one line."""
-    with pytest.raises(TypeError, match="give it a State"):
-        PlannerPolicy(CFG)(_start(CFG).obs, jax.random.key(0))
-
-
 @pytest.fixture(scope="module")
 def learned() -> NetworkPolicy:
-    """Networks as they begin."""
-    parts = actor_critic.make(CFG)
-    params = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0)).online
-    return NetworkPolicy(CFG, params)
+    """Networks that no training gives."""
+    return NetworkPolicy(CFG, random_params(CFG))
 
 
 def test_proposals_are_distinct(learned: NetworkPolicy):

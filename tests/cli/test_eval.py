@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import pytest
 
 from csac_jax import cli
-from csac_jax.cli import evaluate, settings
+from csac_jax.cli import evaluate
 from csac_jax.errors import SettingsError
 from csac_jax.evaluation import policies, rollout, suites
 from csac_jax.report import suite_table
@@ -65,29 +64,6 @@ def test_suites_are_measured_once(
     assert [suite for suite, _ in measured[before + 1 :]] == ["cases"]
 
 
-@pytest.mark.parametrize(
-    ("flags", "name"),
-    [
-        ("shipped_clutter", "shipped_clutter"),
-        ("runs/my.safetensors --policy learned+planner", "my + planner"),
-        ("shipped --policy random", "random"),
-        ("runs/first --name mine", "mine"),
-    ],
-)
-def test_a_result_names_its_policy(flags: str, name: str):
-    """Claim: in tables a policy has the name of its source, of what acts without one, or --name."""
-    options, _ = settings.parse_view(evaluate.EvalOptions, "eval", flags.split())
-    assert evaluate._name(options) == name
-
-
-def test_suites_of_blocks_name_no_library(monkeypatch: pytest.MonkeyPatch):
-    """Claim: a policy that was trained with objects has none in the result of a suite of blocks."""
-    monkeypatch.setattr(rollout, "evaluate", lambda *_, **__: dict(TABLE))
-    options = evaluate.EvalOptions("shipped", policy="random")
-    result = evaluate._measure(lambda *_: None, options, {}, "cases", 1)
-    assert "objects" not in result
-
-
 def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str, int]]):
     """Claim: `--suites all` leaves out suites with targets for a policy trained without, those
     without targets for one trained with, none of these for one trained in both tasks, and suites of
@@ -107,24 +83,6 @@ def test_all_suites_are_those_that_fit(tmp_path: Path, measured: list[tuple[str,
     assert {*evaluate._fitting(options, both)} == set(suites.SUITES)
     anyone = evaluate.EvalOptions("shipped", policy="random", objects="procedural:0:20")
     assert {"target", "random10", "pile"} <= set(evaluate._fitting(anyone, clear))
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        ("--suites cases target", "--suites: several need --out DIR"),
-        ("--suites all", "--suites: several need --out DIR"),
-        ("--out . --json a.json", "--json: is for a single suite"),
-        ("--out . --share 0", "--share: above 0"),
-        ("--out . --jobs -1", "--jobs: must lie in"),
-        ("--out . --suites nowhere", "'nowhere' is neither a case file nor one of"),
-    ],
-)
-def test_bad_arguments(flags: str, message: str, capsys: pytest.CaptureFixture):
-    """Claim: arguments that do not fit are one line, exit code 2."""
-    assert cli.main(["eval", "shipped", *flags.split()]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
 
 
 def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -149,28 +107,6 @@ def test_processes_load_the_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     options, changes, suite, episodes, _ = tasks[0]
     with pytest.raises(SettingsError, match="'no_module' cannot be imported"):
         evaluate._measure(lambda *_: None, options, changes, suite, episodes, ("no_module",))
-
-
-def test_objects_that_stayed_are_printed(capsys: pytest.CaptureFixture):
-    """Claim: of a suite of objects the summary has a table by object, those first that stayed most
-    often, and no more than 12."""
-    objects = {f"cup{i}": {"episodes": 20, "gone": i} for i in range(20)}
-    evaluate.print_summary("pile", {"outcomes": {}, "counts": {}, "objects": objects})
-    printed = capsys.readouterr().out
-    assert "objects that stayed most often, of 20" in " ".join(printed.split())
-    assert [int(n) for n in re.findall(r"cup(\d+)", printed)] == list(range(12))
-
-
-def test_blocks_are_called_objects_where_they_are(capsys: pytest.CaptureFixture):
-    """Claim: the printed table of a suite of objects has no word of blocks; that of blocks does."""
-    share = {"value": 0.5, "low": 0.4, "high": 0.6, "n": 10}
-    summary = {"block_lost": share, "outcomes": {}, "counts": {"blocks": 9, "blocks_lost": 1}}
-    for objects, thing, other in (({"objects": {}}, "object", "block"), ({}, "block", "object")):
-        evaluate.print_summary("pile", summary | objects)
-        printed = " ".join(capsys.readouterr().out.split())
-        assert all(f"{thing}{end}" in printed for end in ("_lost │ 50.0 %", "s 9, ", "s_lost 1"))
-        assert f"{thing}s per action" in printed
-        assert other not in printed
 
 
 @pytest.mark.mjx

@@ -10,20 +10,17 @@ from typing import Any
 
 import jax.numpy as jnp
 import pytest
-from rich.console import Console
 
 import csac_jax
 from csac_jax import algorithms, cli, presets
 from csac_jax.cli import doctor
 from csac_jax.config import Config
 from csac_jax.errors import FailedError, SceneError, SettingsError
-from csac_jax.io import checkpoint, policy_file
+from csac_jax.io import policy_file
 from csac_jax.render import gl
 from csac_jax.runtime import cache, signals
-from csac_jax.sweeps import runner
 from csac_jax.training import loop, programs
 from csac_jax.training.callbacks import RunInfo, Summary
-from csac_jax.training.progress import Terminal
 
 SMOKE = presets.smoke()
 
@@ -116,25 +113,6 @@ def test_missing_extra(
     assert _run(capsys, arguments) == (2, "", wanted)
 
 
-@pytest.mark.parametrize("command", ["train", "sweep"])
-def test_work_that_fails(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: str
-):
-    """Claim: work that fails, or whose folder another process makes meanwhile, is one line and an
-    exit code."""
-    monkeypatch.setattr(programs, "make", lambda cfg, **_: None)
-    for error, code, line in (
-        (FileExistsError(), 2, "there exists; give another --run-dir"),
-        (loop.TrainingError("the loss is not finite"), 1, "the loss is not finite"),
-        (runner.SweepError("all are lost"), 1, "all are lost"),
-        (checkpoint.CheckpointError("4 is damaged"), 1, "4 is damaged"),
-    ):
-        monkeypatch.setattr(loop if command == "train" else runner, "run", _raises(error))
-        ended, _, text = _run(capsys, f"{command} smoke --run-dir there")
-        assert (ended, text.count("\n")) == (code, 1)
-        assert text.startswith(f"csac-jax: {line}")
-
-
 @pytest.mark.parametrize("option", ["eval shipped --json", "report . --markdown", "play --png"])
 def test_a_file_that_cannot_be_written_is_named_first(
     capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, option: str
@@ -181,27 +159,6 @@ def test_watchdog_barks(capsys: pytest.CaptureFixture, monkeypatch: pytest.Monke
         assert barked.wait(30.0)
     assert codes == [1]
     assert capsys.readouterr().err == "csac-jax: it hangs\n"
-
-
-@pytest.mark.parametrize("columns", ["0", "00", "-5", "x", ""])
-def test_lines_are_printed_on_any_terminal(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, columns: str
-):
-    """Claim: a terminal that says it has no columns, or none that are a number, shows the help and
-    the progress."""
-
-    def say(arguments: list[str]) -> int:
-        with Terminal(Console()) as terminal:
-            terminal.log("compiled")
-        return 0
-
-    monkeypatch.setitem(cli.COMMANDS, "doctor", say)
-    monkeypatch.setenv("COLUMNS", columns)
-    assert "compiled" in _run(capsys, "doctor")[1]
-    monkeypatch.setenv("COLUMNS", columns)
-    with pytest.raises(SystemExit):
-        cli.main(["train", "smoke", "--help-all"])
-    assert "--learn.tau" in capsys.readouterr().out
 
 
 def test_result_in_a_missing_folder_is_written(monkeypatch: pytest.MonkeyPatch):

@@ -5,13 +5,10 @@ import json
 from pathlib import Path
 
 import imageio.v2 as imageio
-import numpy as np
 import pytest
 
 from csac_jax import cli, grippers
-from csac_jax.cli import objects
-from csac_jax.objects import importing, library, tables
-from csac_jax.render import sheet
+from csac_jax.objects import importing, library
 
 Capture = pytest.CaptureFixture[str]
 
@@ -35,25 +32,6 @@ def test_make_and_show(tmp_path: Path, capsys: Capture):
     assert names == ["bottle-0-0", "assembly-0-0", "bowl-0-1", "assembly-0-1"]
 
 
-def test_names_are_whole_on_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
-    """Claim: `objects show` prints whole names where the table has little room."""
-    monkeypatch.setenv("COLUMNS", "60")
-    member = tables.find("procedural:0:1", "all").objects[0]
-    long = dataclasses.replace(member, name="a_very_long_name_of_a_mesh_file_from_somewhere_else")
-    objects._list([long])
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("\u2502")]
-    assert "".join(row.split("\u2502")[1].strip() for row in rows) == long.name
-
-
-def test_sheet_of_one_object_is_small_and_shows_its_name(tmp_path: Path):
-    """Claim: a sheet is as wide as its objects need, and cuts no name at its upper edge."""
-    sheet.write(tmp_path / "one.png", tables.find("procedural:0:1", "all").objects)
-    picture = imageio.imread(tmp_path / "one.png")
-    assert picture.shape[1] < picture.shape[0]
-    ink = np.flatnonzero(picture[: len(picture) // 5].min(axis=(1, 2)) < 100)
-    assert 0 < ink.min() < ink.max() < 0.2 * len(picture) - 1
-
-
 def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capture):
     """Claim: objects that the hand cannot open for are named."""
     narrow = dataclasses.replace(grippers.load("rg2"), opening=(0.0, 0.03))
@@ -63,34 +41,6 @@ def test_what_is_too_wide_is_named(monkeypatch: pytest.MonkeyPatch, capsys: Capt
     assert last.startswith("wider than the hand opens, 30 mm: ")
 
 
-REFUSED = {
-    "": (2, "usage"),
-    "mak": (2, "mak"),
-    "make --out x --count 9999": (2, "--count"),
-    "make --out x --seed -1": (2, "--seed"),
-    "make --out .": (2, "--out: . exists"),
-    "show nowhere": (1, "nowhere: no library"),
-    "show procedural:0:3 --png x.txt": (2, ".png"),
-    "import nowhere --out x": (2, "nowhere does not exist"),
-    "import . --out x": (2, "no mesh file"),
-    "import . --out x --density 5": (2, "--density"),
-}
-
-
-@pytest.mark.parametrize("command", REFUSED)
-def test_what_is_refused(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-):
-    """Claim: bad arguments and libraries are one line, exit code 2 or 1, and nothing is written."""
-    monkeypatch.chdir(tmp_path)
-    code, message = REFUSED[command]
-    assert cli.main(["objects", *command.split()]) == code
-    said = "".join(capsys.readouterr())
-    assert message in said
-    assert len(said.splitlines()) == 1
-    assert not any(tmp_path.iterdir())
-
-
 def test_without_the_extra_the_command_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ):
@@ -98,17 +48,3 @@ def test_without_the_extra_the_command_says_so(
     monkeypatch.setattr(importing, "MODULES", ("no_such_module",))
     assert cli.main(["objects", "import", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "pip install 'csac-jax[objects]'" in capsys.readouterr().err
-
-
-def test_suites_need_a_library(capsys: Capture):
-    """Claim: `eval` and `play` refuse a suite of objects without a library, and the other way."""
-    for arguments, message in (
-        (["eval", "shipped_clutter", "--suite", "pile"], "objects: pile needs a library"),
-        (
-            ["eval", "shipped_clutter", "--objects", "x"],
-            "'in_distribution' has no objects of a library",
-        ),
-        (["play", "--scene", "pile"], "objects: pile needs a library"),
-    ):
-        assert cli.main(arguments) == 2
-        assert message in capsys.readouterr().err

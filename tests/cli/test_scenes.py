@@ -94,24 +94,3 @@ def test_case_files_are_candidates(tmp_path: Path, judged: list[int]):
     loaded = certify.load(out)
     assert [one.generator for one in loaded.kept] == ["one", "two"]
     assert loaded.scenes.in_play.tolist() == [[True, False], [True, True]]
-
-
-REFUSED = {
-    "certify bars": "--out",
-    "certify nowhere --out x.npz": "'nowhere' is neither a folder",
-    "certify bars --out x.txt": "--out: x.txt must end in .npz",
-    "certify bars --out x.npz --count 0": "--count",
-    "certify . --out x.npz": "holds no case file",
-}
-
-
-@pytest.mark.parametrize("command", REFUSED)
-def test_what_is_refused(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-):
-    """Claim: what cannot be done ends with one line that says why, code 2, and writes nothing."""
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["scenes", *command.split()]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert REFUSED[command] in line
-    assert not list(tmp_path.iterdir())

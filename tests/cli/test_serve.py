@@ -56,14 +56,14 @@ def test_taken_port_is_told_first(
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="needs curl")
-def test_serves_until_it_is_stopped(tmp_path: Path):
+def test_serves_until_it_is_stopped(tiny: str, tmp_path: Path):
     """Claim: the command prints its address and a call that works as printed. After SIGTERM it
-    answers what it has accepted, and ends within 10 s."""
+    answers what it has accepted, closes silent connections, and ends within 10 s."""
     token = tmp_path / "a token"
     token.write_text(f"{TOKEN}\n")
     camera_image.main(str(tmp_path))
     options = ["--port", "0", "--token-file", str(token)]
-    command = [sys.executable, "-m", "csac_jax", "serve", "shipped_clutter", *options]
+    command = [sys.executable, "-m", "csac_jax", "serve", tiny, *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None
@@ -74,6 +74,7 @@ def test_serves_until_it_is_stopped(tmp_path: Path):
         assert shlex.split(shown)[-2:] == ["@request.json", f"{url}/decide"]
         done = subprocess.run(shown, shell=True, cwd=tmp_path, capture_output=True, text=True)
         assert len(json.loads(done.stdout)["decisions"]) == 1, done.stderr
+        silent = socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2])), timeout=10)
         with concurrent.futures.ThreadPoolExecutor(10) as pool:
             content = (tmp_path / "request.json").read_bytes()
             head = {"Authorization": f"Bearer {TOKEN}"}
@@ -83,6 +84,7 @@ def test_serves_until_it_is_stopped(tmp_path: Path):
             begun = time.perf_counter()
             process.send_signal(signal.SIGTERM)
             assert [future.result().status for future in asked] == [200] * 10
+        assert silent.recv(1) == b""
         assert process.wait(10) == -signal.SIGTERM
         assert time.perf_counter() - begun < 10.0
     finally:

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from csac_jax import cli, geometry, presets
-from csac_jax.agent import actor_critic
 from csac_jax.config import Config
 from csac_jax.deploy import CameraPolicy, decision, stablehlo
 from csac_jax.errors import SettingsError
 from csac_jax.io import policy_file
 from csac_jax.vision.heightmap import Observation
 from tests.deploy import scenes
+from tests.networks import random_params
 
 pytest.importorskip("jax2onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -52,9 +52,11 @@ _BY_ONNXRUNTIME = _ALONE.format(
 )
 
 
-def _alone(script: str, file: Path, *options: str, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Exports a policy that ships and runs the file in a process of its own."""
-    assert cli.main(["export", "shipped_clutter", str(file), *options]) == 0
+def _alone(
+    policy: str, script: str, file: Path, *options: str, **arrays: np.ndarray
+) -> list[np.ndarray]:
+    """Exports a policy and runs the file in a process of its own."""
+    assert cli.main(["export", policy, str(file), *options]) == 0
     np.savez(file.with_suffix(".npz"), **arrays)
     command = [sys.executable, "-c", script, str(file), str(file.with_suffix(".npz"))]
     env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
@@ -64,8 +66,8 @@ def _alone(script: str, file: Path, *options: str, **arrays: np.ndarray) -> list
 
 
 @pytest.fixture(scope="module")
-def policy() -> CameraPolicy:
-    return CameraPolicy.load("shipped_clutter")
+def policy(tiny: str) -> CameraPolicy:
+    return CameraPolicy.load(tiny)
 
 
 @pytest.fixture(scope="module")
@@ -82,20 +84,22 @@ def _assert_close(results: list[Any], cfg: Config, params: Any, *maps: Any, scal
         np.testing.assert_allclose(result, value, atol=atol, rtol=0, err_msg=name)
 
 
-def test_stablehlo_of_maps(policy: CameraPolicy, shown: Any, tmp_path: Path, capsys: Any):
+def test_stablehlo_of_maps(
+    policy: CameraPolicy, shown: Any, tiny: str, tmp_path: Path, capsys: Any
+):
     """Claim: jax alone computes from maps what the policy does, to 1e-4."""
     file = tmp_path / "policy.stablehlo"
-    results = _alone(_BY_JAX, file, "--format", "stablehlo", **shown)
+    results = _alone(tiny, _BY_JAX, file, "--format", "stablehlo", **shown)
     assert f"wrote {file}, {file.stat().st_size} bytes" in capsys.readouterr().out
     _assert_close(results, policy.cfg, policy.params, *shown.values(), scale=1.0)
 
 
 @pytest.mark.slow
-def test_stablehlo_of_an_image(policy: CameraPolicy, tmp_path: Path):
+def test_stablehlo_of_an_image(policy: CameraPolicy, tiny: str, tmp_path: Path):
     """Claim: jax alone computes from an image what `CameraPolicy.decide` returns."""
     options = ["--format", "stablehlo", "--input", "image"]
     image = {"rgb": IMAGE.rgb, "depth": DEPTH, "lens": LENS, "pose": POSE}
-    results = _alone(_BY_JAX, tmp_path / "policy.stablehlo", *options, **image)
+    results = _alone(tiny, _BY_JAX, tmp_path / "policy.stablehlo", *options, **image)
     (decision,) = policy.decide(*IMAGE)
     assert ("push", "grasp")[int(results[0])] == decision.primitive
     np.testing.assert_allclose(results[1][:2], decision.position[:2], atol=1e-3)
@@ -104,9 +108,9 @@ def test_stablehlo_of_an_image(policy: CameraPolicy, tmp_path: Path):
     np.testing.assert_allclose(results[4][:, :3], places, atol=1e-3)
 
 
-def test_onnx(policy: CameraPolicy, shown: Any, tmp_path: Path):
+def test_onnx(policy: CameraPolicy, shown: Any, tiny: str, tmp_path: Path):
     """Claim: onnxruntime alone computes Q and the best cell's action as the policy, to 1e-4."""
-    results = _alone(_BY_ONNXRUNTIME, tmp_path / "policy.onnx", "--format", "onnx", **shown)
+    results = _alone(tiny, _BY_ONNXRUNTIME, tmp_path / "policy.onnx", "--format", "onnx", **shown)
     cfg = policy.cfg.change(policy={"place": "argmax"})
     _assert_close(results, cfg, policy.params, *shown.values(), scale=1.0)
     look = jax.jit(lambda obs: decision.dense_maps(cfg, policy.params, obs, False))
@@ -116,8 +120,7 @@ def test_onnx(policy: CameraPolicy, shown: Any, tmp_path: Path):
 def _random(cfg: Config) -> tuple[Any, Observation]:
     """Draws networks that no training gives, and a map with boxes, half of them targets."""
     rng, rows = np.random.default_rng(3), (cfg.heightmap.size,) * 2
-    blank = actor_critic.abstract_params(cfg)
-    params = jax.tree.map(lambda leaf: rng.normal(0.0, 0.2, leaf.shape).astype("f4"), blank)
+    params = random_params(cfg, 3, 0.2)
     height = rng.uniform(0.0, 0.009, rows).astype(np.float32)  # seen, too low to act on
     target = np.zeros(rows, bool)
     for number in range(4):
@@ -189,7 +192,7 @@ def test_exports_open_as_the_policy():
         _assert_close(results, cfg, params, *maps, scale=1.0)
 
 
-def test_policy_files(policy: CameraPolicy, tmp_path: Path):
+def test_policy_files(policy: CameraPolicy, tiny: str, tmp_path: Path):
     """Claim: a policy file is written with what --augment, --height-bonus and --retry ask for, and
     with a view and hand that are given, else as it is; `--average` writes the mean of each number
     of two policies, and the config of one."""
@@ -200,12 +203,12 @@ def test_policy_files(policy: CameraPolicy, tmp_path: Path):
     world = {"sim": {"pad_friction": (0.8, 0.8)}, "sensor": {"grey": 0.5}}
     for options, changes in (([], {}), (asked, {"policy": changed, **world})):
         copy.unlink(missing_ok=True)
-        assert cli.main(["export", "shipped_clutter", str(copy), *options]) == 0
+        assert cli.main(["export", tiny, str(copy), *options]) == 0
         cfg, params = policy_file.load(copy)
         assert cfg == policy.cfg.change(**changes)
         jax.tree.map(np.testing.assert_array_equal, params, jax.device_get(policy.params))
     policy_file.save(copy, jax.tree.map(lambda leaf: 3.0 * leaf, params), cfg.change(seed=7))
-    assert cli.main(["export", "shipped_clutter", str(mean), "--average", str(copy)]) == 0
+    assert cli.main(["export", tiny, str(mean), "--average", str(copy)]) == 0
     cfg, averaged = policy_file.load(mean)
     assert cfg == policy.cfg
     jax.tree.map(lambda m, one: np.testing.assert_array_equal(m, 2.0 * one), averaged, params)

@@ -194,36 +194,17 @@ def test_command_writes_a_policy(
     assert f"--out: {out} exists; give another name" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("file", "change", "message"),
-    [
-        (
-            "*/outcome.json",
-            None,
-            "the record lacks an action with an outcome and an image after it",
-        ),
-        ("000001/depth.npy", None, r"there is no file .*000001/depth\.npy"),
-        (
-            "000001/intrinsics.json",
-            lambda file: file.replace(b"160", b"320"),
-            "000001: rgb 160 x 120",
-        ),
-    ],
-)
-def test_bad_records_are_refused(
-    policy: CameraPolicy, tmp_path: Path, file: str, change: Any, message: str
-):
+def test_bad_records_are_refused(policy: CameraPolicy, tmp_path: Path):
     """Claim: a record that nothing can be learned from, or that is damaged, is one line that says
     where."""
     folder = _write(tmp_path / "record", *[(BOTH, _grasp(LEFT), Lifted)] * 2)
-    for path in list(folder.glob(file)):
-        content = path.read_bytes()
-        path.unlink()
-        if change is not None:
-            path.write_bytes(change(content))
-    with pytest.raises(SettingsError, match=message) as refused:
+    (folder / "000001" / "depth.npy").unlink()
+    with pytest.raises(SettingsError, match=r"^there is no file .*000001/depth\.npy[^\n]*$"):
         fine_tuning.run(policy, folder)
-    assert "\n" not in str(refused.value)
+    empty = _write(tmp_path / "empty", (BOTH, _grasp(LEFT), None))
+    lacks = r"^[^\n]*the record lacks an action with an outcome and an image after it[^\n]*$"
+    with pytest.raises(SettingsError, match=lacks):
+        fine_tuning.run(policy, empty)
 
 
 def test_loss_that_is_not_finite(policy: CameraPolicy, lesson: Path):

@@ -37,18 +37,6 @@ def test_distortion_is_opencv_s(lens: tuple[float, ...], wanted: tuple[float, fl
     np.testing.assert_allclose(images.distort(camera, np.array([0.5, 0.2])), wanted, atol=1e-9)
 
 
-@pytest.mark.parametrize("lens", [(), LENS])
-def test_points_project_to_their_pixels(lens: tuple[float, ...]):
-    """Claim: each pixel's point lies in that pixel again, with and without distortion."""
-    camera = Intrinsics(**IDEAL, distortion=lens)
-    depth = np.random.default_rng(0).uniform(0.3, 2.0, camera.shape).astype(np.float32)
-    view = images.make(RGB, depth, camera, POSE)
-    pixel, inside = images.project(view.intrinsics, view.pose, view.points.reshape(-1, 3))
-    u, v = np.meshgrid(np.arange(64), np.arange(48))
-    assert inside.all()
-    np.testing.assert_allclose(pixel, np.stack([u, v], -1).reshape(-1, 2), atol=2e-3)
-
-
 def test_points_are_the_scene_s():
     """Claim: the points of a rendered cube lie on its five visible planes, to 0.1 mm."""
     image = scenes.take(scenes.blocks_at([[0.0, 0.0, 0.0]], 0.025))

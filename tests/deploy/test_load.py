@@ -5,8 +5,6 @@ import concurrent.futures
 import http.client
 import json
 import random
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -25,6 +23,7 @@ pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
 
 from csac_jax.deploy import batching, decider, requests, server, service  # isort: skip
+from tests.deploy.running import Running  # isort: skip
 
 PNG = files.encode(np.zeros((16, 16, 3), np.uint8))
 DEPTH = files.encode(np.ones((16, 16), np.uint16))
@@ -57,44 +56,13 @@ class SlowPolicy:
         return [[] for _ in observations]
 
 
-class Service:
-    """A service in a thread."""
+class Service(Running):
+    """The service of a slow policy."""
 
     def __init__(self, seconds: float, folder: Path | None = None) -> None:
         self.policy: Any = SlowPolicy(seconds)
         recorder = None if folder is None else Recorder(folder, "slow")
-        app = service.make(self.policy, "slow", None, recorder, (16, 16))
-        self._server, listener = server.configured(app), server.claim("127.0.0.1", 0)
-        self.port = listener.getsockname()[1]
-        self._thread = threading.Thread(target=self._server.run, args=([listener],), daemon=True)
-        self._thread.start()
-
-    def send(self, path: str, body: Any) -> http.client.HTTPConnection:
-        """Sends a request and awaits no answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
-        content = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-        connection.request("GET" if body is None else "POST", path, content)
-        return connection
-
-    def ask(self, path: str, body: Any = None) -> tuple[int, Any, float]:
-        """Returns status, JSON and seconds of a request."""
-        begun = time.perf_counter()
-        connection = self.send(path, body)
-        answer = connection.getresponse()
-        found = json.loads(answer.read())
-        connection.close()
-        return answer.status, found, time.perf_counter() - begun
-
-    def connect(self) -> socket.socket:
-        """Opens a connection."""
-        return socket.create_connection(("127.0.0.1", self.port), timeout=5)
-
-    def stop(self) -> float:
-        """Stops as SIGTERM does; returns the seconds that it takes."""
-        begun = time.perf_counter()
-        self._server.should_exit = True
-        self._thread.join(20)
-        return time.perf_counter() - begun
+        super().__init__(service.make(self.policy, "slow", None, recorder, (16, 16)))
 
 
 @pytest.fixture
@@ -135,9 +103,9 @@ def test_hostile_bodies_stop_nobody(start: Callable[..., Service], body: bytes):
     one line. Meanwhile /health answers within a second."""
     running, slowest = start(), 0.0
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
-        asked = pool.submit(running.ask, "/decide", body)
+        asked = pool.submit(running.timed, "/decide", body)
         while not asked.done():
-            status, _, seconds = running.ask("/health")
+            status, _, seconds = running.timed("/health")
             assert status == 200
             slowest = max(slowest, seconds)
     status, answer, seconds = asked.result()
@@ -163,7 +131,7 @@ def test_parsing_stops_nobody(
     for path, body in (("/decide", BODY), ("/outcome", outcome)):
         connection = running.send(path, body)
         time.sleep(0.2)
-        assert running.ask("/health")[2] < 0.5
+        assert running.timed("/health")[2] < 0.5
         assert connection.getresponse().status == 400
 
 
@@ -177,7 +145,7 @@ def test_waiting_requests_are_decided_together(
     bodies = [{**BODY, "top": 1 + n % 8} for n in range(40)]
     bodies += [{**BODY, "mask": BODY["depth"], "top": 9}] * 4
     with concurrent.futures.ThreadPoolExecutor(len(bodies)) as pool:
-        answers = list(pool.map(lambda body: running.ask("/decide", body), bodies))
+        answers = list(pool.map(lambda body: running.timed("/decide", body), bodies))
     assert {status for status, *_ in answers} == {200}
     sizes = [len(batch) for batch in running.policy.batches]
     assert (set(sizes) <= {1, 4, 16}, max(sizes)) == (True, 16)
@@ -207,9 +175,9 @@ def test_one_bad_image_spoils_no_batch(
     damaged = {**BODY, "rgb": base64.b64encode(image_files.png_start((16, 16))).decode()}
     bodies = [BODY] * 3 + [damaged] * 2
     with concurrent.futures.ThreadPoolExecutor(9) as pool:
-        first = pool.submit(running.ask, "/decide", BODY)
+        first = pool.submit(running.timed, "/decide", BODY)
         _until(lambda: bool(running.policy.batches))
-        answers = list(pool.map(lambda body: running.ask("/decide", body)[0], bodies))
+        answers = list(pool.map(lambda body: running.timed("/decide", body)[0], bodies))
     assert first.result()[0] == 200
     assert answers == [200] * 3 + [400] * 2
     assert max(map(len, running.policy.batches)) == 4
@@ -231,7 +199,7 @@ def test_failing_policy_stops_nothing(
             connection = running.send("/decide", BODY)
             assert connection.getresponse().status == 500
             connection.close()
-    assert running.ask("/decide", BODY)[0] == 200
+    assert running.timed("/decide", BODY)[0] == 200
 
 
 def test_full_queue_answers_at_once(start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch):
@@ -240,8 +208,8 @@ def test_full_queue_answers_at_once(start: Callable[..., Service], monkeypatch: 
     monkeypatch.setattr(batching, "LONGEST", 1e9)
     running = start(0.1)
     with concurrent.futures.ThreadPoolExecutor(200) as pool:
-        asked = [pool.submit(running.ask, "/decide", BODY) for _ in range(200)]
-        health = [running.ask("/health")[2] for _ in range(20)]
+        asked = [pool.submit(running.timed, "/decide", BODY) for _ in range(200)]
+        health = [running.timed("/health")[2] for _ in range(20)]
         replies = [future.result() for future in asked]
     refused = [reply for reply in replies if reply[0] == 429]
     assert {status for status, *_ in replies} == {200, 429}
@@ -256,9 +224,9 @@ def test_queue_is_as_long_as_it_is_soon_answered(start: Callable[..., Service]):
     gets the status 429."""
     running = start(0.1)
     for _ in range(12):
-        assert running.ask("/decide", BODY)[0] == 200
+        assert running.timed("/decide", BODY)[0] == 200
     with concurrent.futures.ThreadPoolExecutor(40) as pool:
-        replies = list(pool.map(lambda _: running.ask("/decide", BODY), range(40)))
+        replies = list(pool.map(lambda _: running.timed("/decide", BODY), range(40)))
     answered = [seconds for status, _, seconds in replies if status == 200]
     assert [status for status, *_ in replies].count(429) > 12
     assert len(answered) > 3 * decider.THREADS
@@ -273,24 +241,11 @@ def test_nobody_waits_nothing_is_decided(start: Callable[..., Service], tmp_path
     time.sleep(0.2)
     for connection in connections:
         connection.close()
-    status, answer, seconds = running.ask("/decide", BODY)
+    status, answer, seconds = running.timed("/decide", BODY)
     assert (status, answer["id"]) == (200, "000001")
     assert seconds < 1.5
     assert len(running.policy.batches) == decider.THREADS + 1
     assert len(record.read(tmp_path)) == 1
-
-
-def test_stop_answers_what_was_accepted(start: Callable[..., Service]):
-    """Claim: a service that is stopped answers what waits, closes silent connections and ends."""
-    running = start(0.3)
-    silent = running.connect()
-    with concurrent.futures.ThreadPoolExecutor(10) as pool:
-        asked = [pool.submit(running.ask, "/decide", BODY) for _ in range(10)]
-        _until(lambda: len(running.policy.batches) >= decider.THREADS)
-        time.sleep(0.2)
-        assert running.stop() < 10.0
-        assert [future.result()[0] for future in asked] == [200] * 10
-    assert silent.recv(1) == b""
 
 
 def test_memory_of_bodies_is_bounded(
@@ -307,10 +262,10 @@ def test_memory_of_bodies_is_bounded(
         time.sleep(0.3)
     assert stalled.recv(99).startswith(b"HTTP/1.1 429")
     large = {**BODY, "mask": "A" * 200_000}
-    assert running.ask("/decide", large)[0] == 429
-    assert running.ask("/decide", BODY)[0] == 200
+    assert running.timed("/decide", large)[0] == 429
+    assert running.timed("/decide", BODY)[0] == 200
     slow.close()
-    _until(lambda: running.ask("/decide", large)[0] == 400)
+    _until(lambda: running.timed("/decide", large)[0] == 400)
 
 
 def test_sizes_of_images_are_few(start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch):
@@ -319,7 +274,7 @@ def test_sizes_of_images_are_few(start: Callable[..., Service], monkeypatch: pyt
     running = start()
     rgb = [files.encode(np.zeros((16, width, 3), np.uint8)) for width in (16, 17, 18, 17)]
     bodies = [{**BODY, "rgb": base64.b64encode(content).decode()} for content in rgb]
-    replies = [running.ask("/decide", body) for body in bodies]
+    replies = [running.timed("/decide", body) for body in bodies]
     assert [status for status, *_ in replies] == [200, 200, 400, 200]
     assert "compiled for 2 other sizes" in replies[2][1]["detail"]
 
@@ -385,7 +340,7 @@ def test_busy_connections_stay(start: Callable[..., Service], monkeypatch: pytes
     assert answers.count(b"200 OK") == 2
     monkeypatch.setattr(server, "SLOWEST_ANSWER", 0.1)
     with pytest.raises((http.client.RemoteDisconnected, ConnectionError)):
-        running.ask("/decide", BODY)
+        running.timed("/decide", BODY)
 
 
 def test_connections_are_limited(start: Callable[..., Service], monkeypatch: pytest.MonkeyPatch):
@@ -395,25 +350,25 @@ def test_connections_are_limited(start: Callable[..., Service], monkeypatch: pyt
     connections = [running.connect() for _ in range(3)]
     time.sleep(0.2)
     with pytest.raises((http.client.RemoteDisconnected, ConnectionError)):
-        running.ask("/health")
+        running.timed("/health")
     for connection in connections:
         connection.close()
     time.sleep(0.2)
-    assert running.ask("/health")[0] == 200
+    assert running.timed("/health")[0] == 200
 
 
 def test_schema_is_published(start: Callable[..., Service]):
     """Claim: /openapi.json names every path, the fields of both bodies and the statuses of
     refusals. There are no pages of documentation."""
     running = start()
-    status, schema, _ = running.ask("/openapi.json")
+    status, schema, _ = running.timed("/openapi.json")
     assert status == 200
     assert set(schema["paths"]) == {"/decide", "/outcome", "/health", "/version"}
     asked = schema["paths"]["/decide"]["post"]
     fields = asked["requestBody"]["content"]["application/json"]["schema"]["properties"]
     assert set(fields) == set(requests.DecideRequest.model_fields)
     assert {"200", "400", "401", "413", "422", "429", "507"} <= set(asked["responses"])
-    assert [running.ask(path)[0] for path in ("/docs", "/redoc")] == [404, 404]
+    assert [running.timed(path)[0] for path in ("/docs", "/redoc")] == [404, 404]
 
 
 KEYS = ("mask", "top", "distortion", "\ud83d", "x" * 300)
@@ -442,7 +397,7 @@ def test_random_bodies_are_answered(start: Callable[..., Service]):
     statuses = []
     for _ in range(300):
         body = _mutated(rng)
-        status, answer, _ = running.ask("/decide", body)
+        status, answer, _ = running.timed("/decide", body)
         assert status in (200, 400, 422), (status, answer, body)
         assert status == 200 or answer["detail"].count("\n") == 0
         statuses.append(status)

@@ -114,22 +114,6 @@ def test_new_entries_come_last(folder: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "outcome", "number", "message"),
-    [
-        ("../record", "lifted", 1, "there is no decision ../record"),
-        ("000001", "lifted", 3, "number: there are 2 decisions, not 3"),
-        ("000001", "pushed", 1, "outcome: of a grasp it is nothing, empty"),
-        ("000002", "empty", 1, "outcome: of a push it is pushed, not empty"),
-    ],
-)
-def test_outcomes_that_do_not_fit(folder: Path, name: str, outcome: str, number: int, message: str):
-    """Claim: an outcome of no decision, or of another primitive, is refused in one line."""
-    error = FileNotFoundError if "no decision" in message else SettingsError
-    with pytest.raises(error, match=message):
-        Recorder(folder, "shipped").post(name, ReportedOutcome(outcome=outcome, number=number))
-
-
-@pytest.mark.parametrize(
     ("file", "content", "message"),
     [
         ("record.json", None, "is no record: it has no record.json"),

@@ -4,10 +4,8 @@ import base64
 import concurrent.futures
 import contextlib
 import http.client
-import json
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,9 +21,9 @@ from tests.deploy import image_files, scenes
 pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
 
-from csac_jax.deploy import batching, decider, server, service  # isort: skip
+from csac_jax.deploy import batching, decider, service  # isort: skip
+from tests.deploy.running import TOKEN, Running  # isort: skip
 
-TOKEN = "correct horse battery"
 IMAGE = image_files.rounded(scenes.take(scenes.blocks_at([[0.1, 0.09, 0.4], [-0.1, -0.09, 1.0]])))
 CLIENTS = 50
 
@@ -45,67 +43,40 @@ BODY: dict[str, Any] = {
 }
 
 
-class Server:
-    """A service in a thread."""
-
-    def __init__(self, app: Any) -> None:
-        self._server, listener = server.configured(app), server.claim("127.0.0.1", 0)
-        self._thread = threading.Thread(target=self._server.run, args=([listener],), daemon=True)
-        self._thread.start()
-        self.port = listener.getsockname()[1]
-
-    def ask(self, method: str, path: str, body: Any = None, token: str = TOKEN) -> tuple[int, Any]:
-        """Returns status and JSON of a request."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
-        headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
-        content = body if isinstance(body, bytes | None) else json.dumps(body).encode()
-        connection.request(method, path, content, headers)
-        answer = connection.getresponse()
-        found = answer.status, json.loads(answer.read())
-        connection.close()
-        return found
-
-    def stop(self) -> None:
-        self._server.should_exit = True
-        self._thread.join(10)
-
-
 @pytest.fixture(scope="module")
-def policy() -> CameraPolicy:
-    loaded = CameraPolicy.load("shipped_clutter")
+def policy(tiny: str) -> CameraPolicy:
+    loaded = CameraPolicy.load(tiny)
     loaded.warm_up(640, 480, decider.batches())
     return loaded
 
 
 @pytest.fixture(scope="module", name="server")
-def _server(policy: CameraPolicy) -> Iterator[Server]:
-    running = Server(service.make(policy, "shipped_clutter", TOKEN))
+def _server(policy: CameraPolicy) -> Iterator[Running]:
+    running = Running(service.make(policy, "tiny", TOKEN))
     yield running
     running.stop()
 
 
 @pytest.fixture
-def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Server]:
+def recording(policy: CameraPolicy, tmp_path: Path) -> Iterator[Running]:
     """Starts a service that records into the test's folder."""
-    running = Server(
-        service.make(policy, "shipped_clutter", TOKEN, Recorder(tmp_path, "shipped_clutter"))
-    )
+    running = Running(service.make(policy, "tiny", TOKEN, Recorder(tmp_path, "tiny")))
     yield running
     running.stop()
 
 
-def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path):
+def test_records_images_decisions_and_outcomes(recording: Running, tmp_path: Path):
     """Claim: with a record, /decide names an entry, which holds what was sent and answered, and
     /outcome adds to it, with and without a mask."""
     mask = np.zeros((480, 640), np.uint8)
     mask[:, 320:] = 255
-    _, first = recording.ask("POST", "/decide", {**BODY, "top": 2})
+    _, first = recording.ask("/decide", {**BODY, "top": 2})
     marked = {**BODY, "mask": _base64(encode(mask))}
-    _, second = recording.ask("POST", "/decide", marked)
+    _, second = recording.ask("/decide", marked)
     assert [first["id"], second["id"]] == ["000001", "000002"]
     assert second["decisions"][0]["position"][1] < -0.03  # the block at y = -0.09
     outcome = {"id": "000001", "outcome": "dropped", "number": 2.0, "ended": True}
-    assert recording.ask("POST", "/outcome", outcome) == (200, {"id": "000001"})
+    assert recording.ask("/outcome", outcome) == (200, {"id": "000001"})
     one, two = record.read(tmp_path)
     assert one.outcome == record.ReportedOutcome(outcome="dropped", number=2, ended=True)
     assert two.outcome is None
@@ -125,63 +96,64 @@ def test_records_images_decisions_and_outcomes(recording: Server, tmp_path: Path
         ({"id": "000001", "outcome": "good"}, 422, "'outcome' should be 'nothing'"),
         ({"id": "000001", "outcome": "lifted", "number": "1"}, 422, "'number' should be"),
         ({"id": "000001", "outcome": "pushed"}, 400, "outcome: of a grasp it is nothing, empty"),
+        ({"id": "000001", "outcome": "lifted", "number": 3}, 400, "there are 1 decisions, not 3"),
     ],
 )
 def test_bad_outcomes_are_refused(
-    recording: Server, tmp_path: Path, body: Any, status: int, detail: str
+    recording: Running, tmp_path: Path, body: Any, status: int, detail: str
 ):
     """Claim: an outcome that fits no decision gets a status of 400 to 499 and one line, and changes
     nothing."""
-    assert recording.ask("POST", "/decide", BODY)[0] == 200
-    found, answer = recording.ask("POST", "/outcome", body)
+    assert recording.ask("/decide", BODY)[0] == 200
+    found, answer = recording.ask("/outcome", body)
     assert found == status, answer
     assert detail in answer["detail"]
     assert record.read(tmp_path)[0].outcome is None
 
 
-def test_full_disc_is_told(recording: Server, monkeypatch: pytest.MonkeyPatch):
+def test_full_disc_is_told(recording: Running, monkeypatch: pytest.MonkeyPatch):
     """Claim: a decision that cannot be recorded is not answered as if it were."""
 
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Recorder, "add", full)
-    status, answer = recording.ask("POST", "/decide", BODY)
+    status, answer = recording.ask("/decide", BODY)
     assert status == 507
     assert "No space left on device" in answer["detail"]
 
 
-def test_decides_as_the_library(server: Server, policy: CameraPolicy):
+def test_decides_as_the_library(server: Running, policy: CameraPolicy):
     """Claim: /decide answers what `CameraPolicy.decide` returns; without a record there is no id,
     and no outcome is taken. Colours that seem to be swapped are warned of."""
-    status, answer = server.ask("POST", "/decide", {**BODY, "top": 2})
+    status, answer = server.ask("/decide", {**BODY, "top": 2})
     assert status == 200
     for found, decision in zip(answer["decisions"], policy.decide(*IMAGE, top=2), strict=True):
         assert found["primitive"] == decision.primitive
         np.testing.assert_allclose(found["position"], decision.position, atol=1e-4)
     assert (answer["warnings"], answer["id"]) == ([], None)
     assert answer["milliseconds"] > 0
-    status, answer = server.ask("POST", "/outcome", {"id": "000001", "outcome": "lifted"})
+    status, answer = server.ask("/outcome", {"id": "000001", "outcome": "lifted"})
     assert status == 404
     assert "the service records nothing" in answer["detail"]
     swapped = {**BODY, "rgb": _base64(encode(IMAGE.rgb[..., ::-1]))}
-    _, answer = server.ask("POST", "/decide", swapped)
+    _, answer = server.ask("/decide", swapped)
     assert "red and blue seem to be swapped" in answer["warnings"][0]
 
 
-def test_health_and_version(server: Server):
+def test_health_and_version(server: Running):
     """Claim: /health needs no token; /version names policy and versions."""
-    assert server.ask("GET", "/health", token="") == (200, {"status": "ok"})
-    status, answer = server.ask("GET", "/version")
-    assert (status, answer["policy"]) == (200, "shipped_clutter")
+    assert server.ask("/health", token="") == (200, {"status": "ok"})
+    status, answer = server.ask("/version")
+    assert (status, answer["policy"]) == (200, "tiny")
     assert {"python", "jax", "csac-jax"} <= set(answer["versions"])
 
 
 @pytest.mark.parametrize("token", ["", TOKEN[:-1], TOKEN + "x"])
 @pytest.mark.parametrize("path", ["/decide", "/outcome", "/version"])
-def test_token_is_asked_for(server: Server, path: str, token: str):
+def test_token_is_asked_for(server: Running, path: str, token: str):
     """Claim: without the token nothing is decided or told."""
-    status, answer = server.ask("GET" if path == "/version" else "POST", path, BODY, token)
+    status, answer = server.ask(path, None if path == "/version" else BODY, token)
     assert status == 401
     assert "Authorization" in answer["detail"]
 
@@ -209,18 +181,18 @@ def test_token_is_asked_for(server: Server, path: str, token: str):
     ],
     ids=lambda value: value if isinstance(value, int) else "",
 )
-def test_bad_requests_are_refused(server: Server, body: Any, status: int, detail: str):
+def test_bad_requests_are_refused(server: Running, body: Any, status: int, detail: str):
     """Claim: a malformed or oversized request gets a status of 400 to 499 and one line, and the
     service goes on."""
-    found, answer = server.ask("POST", "/decide", body)
+    found, answer = server.ask("/decide", body)
     assert found == status, answer
     assert detail in answer["detail"]
     assert len(answer["detail"]) < 400
-    assert server.ask("GET", "/health") == (200, {"status": "ok"})
+    assert server.ask("/health") == (200, {"status": "ok"})
 
 
 @pytest.mark.slow
-def test_answers_are_those_of_the_schema(server: Server, tmp_path: Path):
+def test_answers_are_those_of_the_schema(server: Running, tmp_path: Path):
     """Claim: of the requests that schemathesis makes of the schema, good and bad ones, all get an
     answer that the schema has. That bytes are a whole PNG no schema can say."""
     pytest.importorskip("schemathesis")
@@ -234,7 +206,7 @@ def test_answers_are_those_of_the_schema(server: Server, tmp_path: Path):
 
 
 @pytest.mark.parametrize("token", [TOKEN, "wrong"])
-def test_body_without_a_length_is_limited(server: Server, token: str):
+def test_body_without_a_length_is_limited(server: Running, token: str):
     """Claim: a chunked body that never ends is cut off."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
     connection.putrequest("POST", "/decide")
@@ -248,15 +220,15 @@ def test_body_without_a_length_is_limited(server: Server, token: str):
             connection.send(piece)
             sent += 1
     assert sent < 300
-    assert server.ask("GET", "/health") == (200, {"status": "ok"})
+    assert server.ask("/health") == (200, {"status": "ok"})
 
 
-def test_many_clients_lose_nothing(server: Server, monkeypatch: pytest.MonkeyPatch):
+def test_many_clients_lose_nothing(server: Running, monkeypatch: pytest.MonkeyPatch):
     """Claim: 50 clients that may wait, each with its own `top`, all get their own answer."""
     monkeypatch.setattr(batching, "LONGEST", 1e9)
     tops = [1 + number % 3 for number in range(CLIENTS)]
     with concurrent.futures.ThreadPoolExecutor(CLIENTS) as pool:
-        asked = [pool.submit(server.ask, "POST", "/decide", {**BODY, "top": n}) for n in tops]
+        asked = [pool.submit(server.ask, "/decide", {**BODY, "top": n}) for n in tops]
         answers = [future.result() for future in asked]
     assert [status for status, _ in answers] == [200] * CLIENTS
     assert [len(answer["decisions"]) for _, answer in answers] == tops

@@ -108,21 +108,6 @@ def test_grid_covers_the_wanted_blocks():
     assert np.all(local.max(axis=0) > around - 0.012)
 
 
-def test_rows_are_trials_of_their_scene():
-    """Claim: every row of a batch is the trial of a pose in the scene that it names, whatever else
-    is in the batch."""
-    lab = certification.make_lab(CFG)._replace(rows=8)
-    scenes = [constructions.TRAIN["bars"].make(jax.random.key(seed)) for seed in (1, 2)]
-    grasps = certification.grid(np.random.default_rng(0), scenes[0])[:10]
-    pairs = [(scenes[0], grasps[:5]), (scenes[1], grasps[5:])]
-    first, last = certification._batches(lab, pairs)
-    assert [len(part[0]) for part in (first, last)] == [8, 2]
-    for scene, part, poses in ((scenes[0], first, grasps[:5]), (scenes[1], last, grasps[8:])):
-        (alone,) = certification._batches(lab, [(scene, poses)])
-        for row, other in zip(jax.tree.leaves(alone), jax.tree.leaves(part), strict=True):
-            np.testing.assert_array_equal(row, other[: len(poses)])
-
-
 @pytest.mark.slow
 def test_a_scene_that_ships_is_certified_again():
     """Claim: in C MuJoCo a scene of the package gets a certificate, twice the same, with the stored

@@ -15,6 +15,7 @@ from csac_jax.env import State
 from csac_jax.evaluation import policies
 from csac_jax.evaluation.policies import GeometricPolicy, NetworkPolicy, OraclePolicy, RandomPolicy
 from csac_jax.io import checkpoint, policy_file
+from tests.networks import random_params
 
 pytestmark = pytest.mark.mjx
 
@@ -25,10 +26,8 @@ SCENES = 3
 
 @pytest.fixture(scope="module")
 def learned() -> NetworkPolicy:
-    """Networks as they begin."""
-    parts = actor_critic.make(CFG)
-    params = jax.jit(lambda key: actor_critic.init(key, parts))(jax.random.key(0)).online
-    return NetworkPolicy(CFG, params)
+    """Networks that no training gives."""
+    return NetworkPolicy(CFG, random_params(CFG))
 
 
 @pytest.fixture(scope="module")
@@ -120,13 +119,15 @@ def test_observation_serves_for_a_state(learned, states):
 
 
 def test_oracle_asks_for_a_state(states):
-    """Claim: the oracle acts on a state, and says so where it is given an observation."""
+    """Claim: the oracle acts on a state; it and the planner say so where they are given an
+    observation."""
     state = _scene(states, 0)
     action = OraclePolicy(CFG)(state, jax.random.key(1))
     places = state.scene.position[np.asarray(state.scene.in_play), :2]
     assert np.linalg.norm(places - action.pose[:2], axis=1).min() < 1e-6
-    with pytest.raises(TypeError, match="give it a State"):
-        OraclePolicy(CFG)(state.obs, jax.random.key(1))
+    for blind in (OraclePolicy(CFG), policies.PlannerPolicy(CFG)):
+        with pytest.raises(TypeError, match="give it a State"):
+            blind(state.obs, jax.random.key(1))
 
 
 @pytest.mark.parametrize("kind", [RandomPolicy, GeometricPolicy, OraclePolicy])

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from csac_jax import env as environment, presets
-from csac_jax.config import SensorConfig, TaskConfig
+from csac_jax.config import Config, SensorConfig, TaskConfig
 from csac_jax.constants import Outcome, Primitive
 from csac_jax.env import Env, State
-from csac_jax.evaluation import policies, rollout, suites
+from csac_jax.evaluation import rollout, suites
 from csac_jax.evaluation.metrics import Episodes
 from csac_jax.evaluation.policies import NetworkPolicy, OraclePolicy, RandomPolicy
 from csac_jax.robot.primitives import Action
@@ -230,25 +230,32 @@ def test_oracle_beats_random_in_physics():
     assert oracle.completed.mean() >= 0.75
 
 
+ANY: Any = {"sim": {"physics": "auto"}}
+ONE = presets.quick().change(scene={"packed_fraction": 0.0}, **ANY)
+BOTH = presets.general().change(heightmap={"view": "both"}, sensor=SensorConfig(), **ANY)
+
+
 @pytest.mark.parametrize(
-    ("change", "text"),
+    ("cfg", "change", "text"),
     [
-        ({"sim": {"gripper": "franka_hand"}}, "hand rg2, not franka_hand: expect less"),
-        ({"heightmap": {"view": "oblique"}}, "view maps from above, not exact images of an"),
-        ({"task": {"kind": "target"}}, "task take all, not get a marked one"),
-        ({"scene": {"slots": ("object",) * 5, "objects": "x"}}, "with blocks, not objects of"),
-        ({"train": {"scenes": 1}, "sim": {"physics": "c"}}, None),
+        (ONE, {"sim": {"gripper": "franka_hand"}}, "hand rg2, not franka_hand: expect less"),
+        (ONE, {"heightmap": {"view": "oblique"}}, "view maps from above, not exact images of an"),
+        (ONE, {"task": {"kind": "target"}}, "task take all, not get a marked one"),
+        (ONE, {"scene": {"slots": ("object",) * 5, "objects": "x"}}, "with blocks, not objects of"),
+        (ONE, {"train": {"scenes": 1}, "sim": {"physics": "c"}}, None),
+        *((BOTH, {"task": {"kind": kind}}, None) for kind in ("clear", "target")),
+        *((BOTH, {"heightmap": {"view": view}}, None) for view in ("ortho", "oblique")),
+        *((BOTH, {"scene": {"slots": (s,), "min_blocks": 1}}, None) for s in ("box", "object")),
     ],
 )
 def test_policies_say_what_they_were_not_made_for(
-    monkeypatch: pytest.MonkeyPatch, change: dict[str, Any], text: str | None
+    monkeypatch: pytest.MonkeyPatch, cfg: Config, change: dict[str, Any], text: str | None
 ):
     """Claim: an evaluation of networks warns in one line of a hand, view, task or objects that they
-    were not trained with; one of other policies does not, nor of what changes no decision."""
-    cfg = presets.quick().change(scene={"packed_fraction": 0.0}, sim={"physics": "auto"})
-    suite = suites.PreparedSuite(
-        "s", cfg, {"s": types.SimpleNamespace(cfg=cfg.change(**change), scenes=None)}, 1, 0
-    )
+    were not trained with; one of other policies does not, nor of what changes no decision, nor of
+    networks that were trained in both."""
+    part = types.SimpleNamespace(cfg=cfg.change(**change), scenes=None)
+    suite = suites.PreparedSuite("s", cfg, {"s": part}, 1, 0)
     monkeypatch.setattr(rollout, "rollout", lambda *_: None)
     monkeypatch.setattr(rollout.metrics, "summarise", lambda _: {})
     monkeypatch.setattr(rollout.object_slots, "fingerprint", lambda *_: "")
@@ -261,23 +268,3 @@ def test_policies_say_what_they_were_not_made_for(
     lines = [str(warning.message) for warning in caught]
     assert len(lines) == (text is not None)
     assert all(text in line and "\n" not in line for line in lines)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"task": {"kind": "clear"}},
-        {"task": {"kind": "target"}},
-        {"heightmap": {"view": "ortho"}},
-        {"heightmap": {"view": "oblique"}},
-        {"scene": {"slots": ("box",), "min_blocks": 1}},
-        {"scene": {"slots": ("object",), "min_blocks": 1}},
-    ],
-)
-def test_policies_of_both_know_either(change: dict[str, Any]):
-    """Claim: nothing warns of task, view or objects of a policy that was trained in both."""
-    world = {"sim": {"physics": "auto"}, "sensor": SensorConfig()}
-    cfg = presets.general().change(heightmap={"view": "both"}, **world)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        policies.warn_if_elsewhere(NetworkPolicy(cfg, None), cfg.change(**change))

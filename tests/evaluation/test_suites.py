@@ -136,18 +136,6 @@ def test_suites_ask_policies_of_both_tasks_for_theirs(tmp_path: Path):
     assert suites.prepare(both, "in_distribution", EPISODES, 0).cfg.task.kind == "clear"
 
 
-def test_users_case_file(tmp_path: Path):
-    """Claim: a case file of the user's is a suite by itself."""
-    path = tmp_path / "mine.json"
-    pose = {"position": [0.0, 0.1, 0.025], "quaternion": [1, 0, 0, 0]}
-    block = {"shape": "cube", "colour": "red", **pose}
-    path.write_text(json.dumps({"name": "mine", "blocks": [block]}))
-    (env,) = suites.prepare(CFG, str(path), EPISODES, 0).parts.values()
-    assert env.cfg.scene.slots == ("box",)
-    with pytest.raises(ValueError, match="target"):
-        suites.prepare(TARGET, str(path), EPISODES, 0)
-
-
 @pytest.mark.parametrize(("suite", "blocks", "most"), [("random10", 10, 25), ("random30", 30, 75)])
 def test_dropped_suites(monkeypatch: pytest.MonkeyPatch, suite: str, blocks: int, most: int):
     """Claim: random10 and random30 hold ten and thirty blocks of all kinds, contacts and actions

@@ -19,7 +19,6 @@ from hypothesis import HealthCheck, Phase, given, seed, settings, strategies as 
 from jax._src import compilation_cache
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic
 from csac_jax.errors import FailedError
 from csac_jax.io import checkpoint, configs, files, leaves, policy_file
 from csac_jax.io.checkpoint import CheckpointError
@@ -33,6 +32,7 @@ from csac_jax.sweeps.runner import SweepError, SweepPlan
 from csac_jax.world import scene_state
 from tests.faults import harness
 from tests.faults.harness import DAMAGES, Tally, fault
+from tests.networks import random_params
 
 CFG = presets.smoke()
 LONGEST = 1000  # characters of a message: it is one line, not the file again
@@ -80,15 +80,9 @@ def _damaged(prepare: Prepare, kind: str, tally: Tally, rng: Rng, tries: int, fo
         _judge(tally, harness.damage(rng, kind, path), again, expected)
 
 
-def _params(number: int) -> Any:
-    rng = np.random.default_rng(number)
-    blank = actor_critic.abstract_params(CFG)
-    return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
-
-
 def _policy(folder: Path) -> tuple[Path, Callable[[], Any], type[Exception]]:
     path = folder / "policy.safetensors"
-    policy_file.save(path, _params(0), CFG)
+    policy_file.save(path, random_params(CFG), CFG)
 
     def read() -> Any:
         cfg, params = policy_file.load(path)
@@ -238,7 +232,7 @@ def _foreign(tally: Tally, rng: Rng, tries: int, folder: Path) -> None:
     own = path.read_bytes()
     with safetensors.safe_open(path, "numpy") as file:
         remarks = file.metadata()
-    others = safetensors.numpy.load(safetensors.numpy.save(leaves.named(_params(1))))
+    others = safetensors.numpy.load(safetensors.numpy.save(leaves.named(random_params(CFG, 1))))
     names = list(others)
 
     def swapped() -> bytes:

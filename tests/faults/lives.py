@@ -41,7 +41,6 @@ import numpy as np
 import safetensors.numpy
 
 from csac_jax import presets
-from csac_jax.agent import actor_critic
 from csac_jax.cli import output
 from csac_jax.constants import GRASP_WINDOW
 from csac_jax.errors import DataWarning, FailedError, SettingsError
@@ -57,6 +56,7 @@ from csac_jax.sweeps.runner import SweepPlan
 from csac_jax.training import loop
 from tests.faults import harness, toy
 from tests.faults.harness import Tally
+from tests.networks import random_params
 
 CFG = presets.smoke()
 REPORTED = (SettingsError, FailedError, OSError)  # what a command shows as one line
@@ -148,10 +148,7 @@ def _reference(seed: int) -> toy.Reference:
     return toy.Reference(seed)
 
 
-@functools.cache
-def _params(number: int) -> Any:
-    rng, blank = np.random.default_rng(number), actor_critic.abstract_params(CFG)
-    return jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(leaf.dtype), blank)
+_params = functools.cache(functools.partial(random_params, CFG))
 
 
 class _Reporter(toy.Quiet):

@@ -253,14 +253,3 @@ def test_texts_that_take_the_square_of_their_length(
     with pytest.raises(SettingsError, match=message):
         configs.load_config(path)
     assert time.monotonic() - begun < 1.0
-
-
-def test_missing_or_contradicting_file_is_named(tmp_path: Path):
-    """Claim: a file that is not there, a folder, or one of another preset is one line."""
-    (tmp_path / "folder.toml").mkdir()
-    for name in ("no.toml", "folder.toml"):
-        with pytest.raises(SettingsError, match=rf"{name}: .*(No such file|folder)"):
-            configs.load_config(tmp_path / name, "smoke")
-    path = _file(tmp_path, 'preset = "quick"')
-    with pytest.raises(SettingsError, match="preset: is 'quick'; leave out smoke, or change the"):
-        configs.load_config(path, "smoke")

@@ -31,31 +31,6 @@ def _config(size: int = 224, **net: Any) -> Config:
     return presets.smoke().change(heightmap={"size": size}, net={"kind": "densenet121", **net})
 
 
-SMALL = {"kind": "small"}
-
-
-@pytest.mark.parametrize(
-    ("size", "net", "message"),
-    [
-        (224, {"block_layers": (6, 12, 0, 16)}, "net.block_layers: unknown setting"),
-        (224, {"norm": "layer"}, "net.norm: 'layer' is not one of: group, batch"),
-        (224, {"kind": "offset"}, "net.kind: 'offset' is not one of: small, densenet121"),
-        (224, {"stem": 16}, "net.stem: unknown setting"),
-        (64, {**SMALL, "norm": "batch"}, "net.norm: unknown setting"),
-        (64, {**SMALL, "stride": 3}, "net.stride: 3 is not one of: 2, 4"),
-        (64, {**SMALL, "subpixel": 3}, "net.subpixel: 3 is not one of: 1, 2, 4"),
-        (64, {**SMALL, "subpixel": 4}, "net.subpixel: at most net.stride, 2"),
-        (64, {**SMALL, "dilations": ()}, "net.dilations: at least one layer"),
-        (64, {"rotations": 5}, "net.rotations: must be even"),
-    ],
-)
-def test_config_that_no_net_can_have(size: int, net: dict[str, Any], message: str):
-    """Claim: settings that do not go together are refused in one line."""
-    with pytest.raises(ValueError, match=f"^{message}") as raised:
-        _config(size, **net)
-    assert "\n" not in str(raised.value)
-
-
 @pytest.mark.parametrize("kind", ["small", "densenet121"])
 def test_strides_divide_rotated_maps(kind: str):
     """Claim: rotated maps of any height map are about 1/8, or sqrt(2) - 1, larger, by whole cells

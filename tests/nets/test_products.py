@@ -1,7 +1,6 @@
 """Convolutions as matrix products against XLA's own, the pool against Flax's; values and
 gradients."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -56,19 +55,6 @@ def test_products_are_convolutions(module: nn.Module, stride: int, size: int):
         )
 
     _assert_same(ours, plain, (maps, kernel), gradient)
-
-
-def test_doubled_cells_are_pixels_twice_over():
-    """Claim: the first convolution takes doubled cells as pixels repeated; gradients too."""
-    maps, kernel, gradient = _random(1, (2, 8, 12, 3), (7, 7, 3, 5), (2, 8, 12, 5))
-
-    def see(doubled: bool, maps: jax.Array, kernel: jax.Array) -> jax.Array:
-        return products.Stem(5, doubled, jnp.float32).apply({"params": {"kernel": kernel}}, maps)
-
-    def repeated(maps: jax.Array, kernel: jax.Array) -> jax.Array:
-        return see(False, jnp.repeat(jnp.repeat(maps, 2, axis=1), 2, axis=2), kernel)
-
-    _assert_same(functools.partial(see, True), repeated, (maps, kernel), gradient)
 
 
 def _flax_pool(maps: jax.Array) -> jax.Array:

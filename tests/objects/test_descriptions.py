@@ -51,15 +51,6 @@ def test_a_urdf_has_the_volume_and_inertia_of_its_mesh(bent: trimesh.Trimesh, tm
     assert share == pytest.approx(1.0, abs=0.1)
 
 
-def test_geoms_of_an_mjcf_count_once_where_they_overlap(tmp_path: Path):
-    """Claim: two boxes that share a third have the closed form of the volume of both."""
-    boxes = "".join(f'<geom type="box" size=".015 .01 .01" pos="{x} 0 0"/>' for x in (0, 0.02))
-    path = _text(tmp_path, "a.xml", _MJCF.format(boxes))
-    member, share = conversion.convert(path, "a", ImportSettings())
-    assert member.volume == pytest.approx(0.05 * 0.02 * 0.02, rel=1e-4)
-    assert share == pytest.approx(1.0, rel=1e-4)
-
-
 @pytest.mark.parametrize(
     ("kind", "size", "volume"),
     [

@@ -28,15 +28,6 @@ def test_volume_and_inertia_are_trimeshs(seed: int):
     np.testing.assert_allclose(solid.inertia(whole), mesh.moment_inertia, rtol=1e-5, atol=1e-14)
 
 
-def test_joined_boxes_are_one_box():
-    """Claim: two boxes side by side have the closed form of the box that they make up."""
-    halves = [solid.convex(CUBE * [0.5, 2.0, 3.0] + [x, 0.0, 0.0]) for x in (0.0, 0.5)]
-    whole = solid.joined(map(solid.moments, halves))
-    expected = 6.0 * np.diag([4.0 + 9.0, 1.0 + 9.0, 1.0 + 4.0]) / 12.0
-    assert whole.volume == pytest.approx(6.0)
-    np.testing.assert_allclose(solid.inertia(whole), expected, atol=1e-9)
-
-
 def test_principal_axes_are_scipys():
     """Claim: principal moments are those of SciPy; the axes are right-handed and turn the moments
     into the matrix, also of a ball, a cylinder and what is aligned with its axes but for rounding.

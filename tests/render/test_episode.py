@@ -2,18 +2,14 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 
-from csac_jax import cli, presets
+from csac_jax import cli
 from csac_jax.cli import play
-from csac_jax.env import Env
 from csac_jax.render import episode, gl
-from csac_jax.world import scene_state
 
 pytestmark = pytest.mark.mjx
 
@@ -54,74 +50,8 @@ def test_episode_of_one_block(here: Path, capsys: pytest.CaptureFixture):
     assert row[-1] < row[0] - 5  # the cube is seen to rise
 
 
-def _step(
-    cleared: int = 0,
-    blocks_lost: int = 0,
-    terminated: bool = False,
-    reward: float = 0.0,
-    target: int = scene_state.ANY,
-    actions: int = 1,
-    diverged: bool = False,
-    failed: int = 0,
-    objects: Any = None,
-) -> Any:
-    """The parts of a step that an episode's summary reads."""
-    info = {"cleared": cleared, "blocks_lost": blocks_lost, "physics_diverged": np.bool_(diverged)}
-    counts = {"actions": np.int32(actions), "failed_grasps": np.int32(failed)}
-    after = {"info": SimpleNamespace(**info), "terminated": np.bool_(terminated), **counts}
-    scene = SimpleNamespace(target=target, object_id=objects, certified=None)
-    return SimpleNamespace(after=SimpleNamespace(**after, reward=reward, scene=scene))
-
-
-DONE, LOST = _step(cleared=1, terminated=True), "1 block left the workspace"
-TAKEN = _step(cleared=1, reward=1.0, target=0, terminated=True)
-
-
-@pytest.mark.parametrize(
-    ("steps", "said"),
-    [
-        ([_step(cleared=2), DONE], ("the table is clear", "3 blocks taken")),
-        ([_step(blocks_lost=1, terminated=True)], ("no block is left", "0 blocks taken", LOST)),
-        ([_step(blocks_lost=1, terminated=True, objects=(3,))], ("no object is left", "1 object")),
-        ([_step(blocks_lost=1), TAKEN], ("the target is taken", "1 block taken", LOST)),
-        ([_step(actions=30)], ("action limit",)),
-        ([_step()], ("nothing changed",)),
-        ([_step(diverged=True)], ("physics diverged",)),
-    ],
-)
-def test_summary_says_what_became_of_the_blocks(steps: list[Any], said: tuple[str, ...]):
-    """Claim: the last line of an episode tells blocks taken from blocks lost, and why it ended."""
-    env = Env(presets.smoke().change(task={"max_actions": 30}), None, None, max_failures=2)
-    text = episode.summary(env, steps)
-    assert all(part in text for part in said)
-    assert f"after {len(steps)} action" in text
-    assert episode.completed(steps) == (said[0] in ("the table is clear", "the target is taken"))
-
-
 def _is_red(image: np.ndarray) -> np.ndarray:
     return image[..., 0] > 40 + image[..., 1:].max(axis=2).astype(int)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        ("--scene nowhere", 2, "--scene: 'nowhere' is neither a case file nor one of: random"),
-        ("--scene cases", 2, "--scene: cases has several parts"),
-        ("--size 95 64", 2, "--size: both numbers must be even"),
-        ("--policy nowhere", 1, "there is no folder nowhere"),
-        ("--png a.txt", 2, "a.txt: its name must end in"),
-        ("--video a.png", 2, "a.png: its name must end in"),
-    ],
-)
-def test_bad_arguments_are_one_line(
-    here, capsys: pytest.CaptureFixture, arguments: str, code: int, message: str
-):
-    """Claim: what cannot be played is one line that names it, before anything is simulated."""
-    assert cli.main(["play", *arguments.split()]) == code
-    captured = capsys.readouterr()
-    assert message in captured.err
-    assert captured.err.count("\n") == 1
-    assert captured.out == ""
 
 
 @pytest.mark.parametrize(("scene", "kind"), [("enclosed", "target"), ("blocked", "clear")])

@@ -142,13 +142,6 @@ def test_gather_returns_the_items_of_its_slots():
     assert batch["map"][:, 0, 0].tolist() == [3, 1, 3]
 
 
-def test_memory_of_a_ring_is_that_of_its_leaves():
-    """Claim: the memory that a ring needs is that of its items and priorities."""
-    state = empty()
-    held = sum(leaf.nbytes for leaf in jax.tree.leaves((state.items, state.priority)))
-    assert ring.bytes_needed(CAPACITY, EXAMPLE) == held
-
-
 def test_too_many_items_at_once():
     """Claim: as many items as slots fill the ring; more are an error that names the setting."""
     full = ring.add(empty(), items(range(1, 8)), jnp.ones(7, bool))

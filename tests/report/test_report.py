@@ -190,21 +190,6 @@ def test_numbers_as_json(recorded: Path):
     assert first["settings as a command"] == command
 
 
-def test_variants_of_many_changes_are_named_by_their_folder(tmp_path: Path):
-    """Claim: a variant with more than six changes has the name of its folder, its evaluation also
-    that of its file; settings that no result depends on name no variant."""
-    config = _config("csac_beta", 0, **MANY)
-    _run(tmp_path / "wide" / "seed-0", config, [0.5])
-    _evaluation(tmp_path / "wide" / "seed-0" / "eval-2f85.json", config, 5)
-    report = _report(tmp_path)
-    names = {row["policy"] for row in result_tables.evaluation(report)}
-    assert names == {f"CSAC-beta ({config['preset']}), wide, eval-2f85"}
-    few = comparison.label(report.curves[0].variant, preset=False, most=3)
-    assert (few.count(", "), few[-12:]) == (4, ", others (4)")
-    same = _config("vpg", 0, train__chunk=7, train__save_every=3)
-    assert variants.variant(same).changed == ()
-
-
 def test_evaluation_ends_with_the_mean_of_the_parts(recorded: Path):
     """Claim: after the parts of a suite a row has their mean, over all episodes."""
     rows = result_tables.evaluation(_report(recorded))
@@ -557,17 +542,6 @@ def test_figures(recorded: Path):
     assert (list(map(len, colours)), len(set(colours[1]))) == ([6, 3], 3)
 
 
-def test_methods_of_a_figure_have_colours_of_their_own():
-    """Claim: as many methods as a figure has are of different colours, an algorithm's first variant
-    of the same one everywhere."""
-    own = ["own learner", "mine", "another", "random", "geometric", "oracle"]
-    for methods in ([*variants.NAMES, *own], ["csac_beta"] * 12, [*own, "vpg", "vpg"]):
-        colours = figures._colours(methods)
-        assert len(set(colours)) == len(colours)
-        for algo in set(methods) & set(variants.NAMES):
-            assert colours[methods.index(algo)] == figures.COLOURS[algo]
-
-
 def test_page_needs_nothing_else(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     """Claim: `report --out` writes one page with its figures and media inside, and the tables as
     text; `--json` the numbers."""
@@ -624,16 +598,6 @@ def test_reads_without_jax(recorded: Path):
     command = [sys.executable, "-c", code, str(recorded)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-
-
-def test_damaged_lines_are_counted(recorded: Path, capsys: pytest.CaptureFixture):
-    """Claim: a log with damaged lines is used without them, and a note counts them."""
-    log = recorded / "max" / "metrics.jsonl"
-    log.write_bytes(b'\xff\xfe\n[]\n{"step": "x"}\n' + log.read_bytes())
-    assert cli.main(["report", str(recorded)]) == 0
-    printed, complaint = capsys.readouterr()
-    assert len(re.findall("max/metrics.jsonl: 3 of .* lines are damaged", printed)) == 1
-    assert complaint == ""
 
 
 @pytest.mark.parametrize(

@@ -136,24 +136,6 @@ def test_search_chooses_by_completion(tmp_path: Path):
     assert row == {"searched": "vpg", **best}
 
 
-def test_faults_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Claim: a damaged plan or archive ends a command with exit code 1 and one line that names
-    it."""
-    plan = tmp_path / "runs" / "replay" / "reaper-16" / files.SWEEP_PLAN
-    plan.parent.mkdir(parents=True)
-    plan.write_text("{}")
-    assert second_study.main(["status", str(tmp_path / "runs"), "--smoke"]) == 1
-    (tmp_path / "second-replay.tar.xz").write_text("no archive")
-    assert second_study.main(["report", "--archives", str(tmp_path), "--smoke"]) == 1
-    assert second_study.main(["plan", "--only", "replay/*-3"]) == 1
-    first, second, third = capsys.readouterr().err.splitlines()
-    assert f"{plan} cannot be read" in first
-    assert "second-replay.tar.xz is no archive of runs" in second
-    assert "--only replay/*-3: no arm has such a name" in third
-    assert second_study.main(["plan", "--only", "control/*", "replay/*-16"]) == 0
-    assert "21.0 minutes in all" in capsys.readouterr().out
-
-
 @pytest.mark.slow
 def test_smoke(tmp_path: Path):
     """Claim: `run` begins no arm that does not fit into its minutes; it trains an arm with a

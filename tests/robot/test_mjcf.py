@@ -54,7 +54,8 @@ def test_hand_opens_as_its_numbers_say(name: str):
 
 @pytest.mark.parametrize("name", grippers.shipped())
 def test_gripper_hangs_at_the_flange(name: str):
-    """Claim: the tip frame is adapter and depth from the arm's flange, fingers down, z back."""
+    """Claim: the tip frame is adapter and depth from the arm's flange, fingers down, z back. The
+    arm collides with nothing and is free of gravity."""
     gripper = grippers.load(name)
     sim = SimConfig(gripper=name, robot="ur5e", adapter=0.03, base=(0.5, -0.1, 0.4, 0.3))
     world = model.build(SCENE, sim)
@@ -68,6 +69,11 @@ def test_gripper_hangs_at_the_flange(name: str):
     np.testing.assert_allclose(base.xmat[[0, 3]], [np.cos(0.3), np.sin(0.3)])
     foot = world.model.geom("ur5e/base")
     assert data.geom("ur5e/base").xpos[2] - foot.size[1] == pytest.approx(0.0, abs=1e-6)
+    built = world.model
+    arm = [i for i in range(built.ngeom) if built.geom(i).name.startswith("ur5e/")]
+    assert len(arm) == 8
+    assert not (built.geom_contype[arm] | built.geom_conaffinity[arm]).any()
+    assert (built.body_gravcomp[built.geom_bodyid[arm][1:]] == 1.0).all()
 
 
 def _changed(folder: Path, name: str, *changes: tuple[str, str]) -> str:

@@ -10,8 +10,6 @@ from typing import Any
 import pytest
 
 import csac_jax
-from csac_jax.errors import SettingsError
-from csac_jax.runtime import cluster
 from csac_jax.sweeps.runner import SUMMARY
 from tests.training import test_loop
 
@@ -71,13 +69,3 @@ def test_two_processes_are_one(shard: str, tmp_path: Path):
     assert _logs(tmp_path / "again") == _logs(tmp_path / "two")
     names = {path.name for path in (tmp_path / "two").iterdir()}
     assert names == {".lock", "a", "groups", SUMMARY, "sweep.json"}
-
-
-def test_place_among_the_processes():
-    """Claim: a process whose number is not among those that there are is refused before it waits
-    for anybody; without other processes nobody is asked."""
-    with pytest.raises(SettingsError, match=r"process_id: must lie in 0 \.\. 1, not 2"):
-        cluster.join("127.0.0.1:1", 2, 2)
-    assert [cluster.agree(signal) for signal in (None, 2, 15)] == [None, 2, 15]
-    assert cluster.is_first()
-    cluster.wait("nobody")

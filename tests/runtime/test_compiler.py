@@ -9,8 +9,6 @@ from csac_jax import presets
 from csac_jax.nets.convolution import conv2d
 from csac_jax.runtime import compiler
 
-TAKEN = "__ynn_fusion"  # what the library computes is called in a compiled program
-
 
 @pytest.fixture
 def forgotten(monkeypatch: pytest.MonkeyPatch):

@@ -206,23 +206,6 @@ def test_shipped_cases_are_held_out(drawn: Drawn):
     assert max(cluster["arch"] for cluster in clusters) == 1
 
 
-ALL = {"wall", "stairs", "fan", "bridge", "tower", "wedge", "corner", "bin"}
-
-
-@pytest.mark.parametrize(
-    ("slots", "names"),
-    [
-        (("box", "box", "box"), ALL - {"bin"}),
-        (("box", "box", "prism", "box", "cylinder"), ALL),
-        (("box", "box", "prism"), ALL - {"bridge", "bin"}),
-        (("box", "box", "arch"), {"stairs", "fan", "corner"}),
-    ],
-)
-def test_families_follow_from_the_slots(slots: tuple, names: set):
-    """Claim: a family is drawn exactly where the slots have the kinds that it needs."""
-    assert set(packings.available(slots)) == names
-
-
 def test_settings_that_allow_none_are_an_error():
     """Claim: slots that allow no family, or a square that is too small, name the field."""
     for slots in (("box",), ("box", "box"), ("prism", "prism", "arch"), ("arch", "arch", "box")):

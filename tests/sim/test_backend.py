@@ -1,20 +1,14 @@
 """`sim.physics auto`: what it stands for, whatever this machine has."""
 
-import functools
 import subprocess
 import sys
 import typing
 
-import jax
-import jax.numpy as jnp
 import pytest
 
-from csac_jax import grippers, presets
-from csac_jax.config import Config, PhysicsKind, RobotKind, SceneConfig
-from csac_jax.robot import primitives
-from csac_jax.robot.primitives import Action
+from csac_jax import presets
+from csac_jax.config import Config, PhysicsKind
 from csac_jax.sim import backend, physics
-from csac_jax.world import model
 
 
 def _config(kind: PhysicsKind, mesh_jitter: float = 0.0, scenes: int = 256) -> Config:
@@ -75,20 +69,6 @@ def test_other_choices_stay():
         assert backend.resolve(_config(kind)) == _config(kind)
     with pytest.raises(ValueError, match=r"sim\.physics: 'auto' .* one of: mjx, warp, c"):
         physics.make(None, _config("auto").sim)
-
-
-@pytest.mark.parametrize("gripper", grippers.shipped())
-@pytest.mark.parametrize("kind", typing.get_args(RobotKind))
-def test_plans_move_every_robot_of_the_config(kind: RobotKind, gripper: str):
-    """Claim: every shipped robot and gripper gets a start per joint, a set-point per actuator."""
-    cfg = Config().change(sim={"robot": kind, "gripper": gripper, "physics": "c"})
-    world = model.build(SceneConfig(slots=("box",), min_blocks=1), cfg.sim)
-    height = jnp.zeros((cfg.heightmap.size,) * 2)
-    plan = primitives.plan(cfg.sim, cfg.heightmap, height, Action.grasp(0.05, 0.1, 0.3))
-    joints = jax.jit(functools.partial(primitives.joint_trajectory, cfg.sim))(plan)
-    assert joints.start.shape == world.robot_qpos.shape
-    assert joints.control.shape == (cfg.sim.substeps, world.model.nu)
-    assert joints.reachable
 
 
 def test_choice_needs_no_mujoco():

@@ -14,9 +14,8 @@ import pytest
 from csac_jax import env as environment, grippers
 from csac_jax.config import Config, PhysicsKind, SceneConfig, SimConfig
 from csac_jax.constants import Outcome, Primitive
-from csac_jax.errors import SettingsError
 from csac_jax.grippers import Grip
-from csac_jax.robot import mjcf, primitives
+from csac_jax.robot import primitives
 from csac_jax.robot.primitives import Action
 from csac_jax.sim import c_physics, outcome, physics as simulation
 from csac_jax.vision import observe
@@ -151,27 +150,6 @@ def test_fingers_are_all_that_moves_with_a_pad(gripper: str):
     assert (world.hand_parts == 0).sum() == 1
 
 
-def test_a_jaw_may_be_fixed_and_fingers_may_hang_lower():
-    """Claim: a pad on the root itself is its own finger; fingers below one common body are two."""
-    geom = '<geom name="{}" size="0.01" pos="{} 0 0"/>'
-    finger = '<body name="{0}"><joint type="slide"/>{1}{2}</body>'.format
-    high = finger("right", geom.format("high", 1), geom.format("knuckle", 2))
-    low = finger("left", geom.format("low", -1), geom.format("nail", -2))
-    palm, found = geom.format("palm", 0), []
-    for below in (geom.format("low", -1) + high, f'<body name="base">{low}{high}</body>'):
-        hand = mujoco.MjSpec.from_string(
-            f'<mujoco><worldbody><body name="root">{palm}{below}</body></worldbody></mujoco>'
-        )
-        spec = mujoco.MjSpec()
-        spec.attach(hand, prefix=mjcf.PREFIX, frame=spec.worldbody.add_frame())
-        own = dataclasses.replace(grippers.load("rg2"), palm="palm", pads=("low", "high"))
-        parts = mjcf.hand_geoms(spec, own)
-        found.append([[name.removeprefix(mjcf.PREFIX) for name in part] for part in parts])
-    fixed, hanging = found
-    assert fixed == [["palm"], ["low"], ["high", "knuckle"]]
-    assert hanging == [["palm"], ["low", "nail"], ["high", "knuckle"]]
-
-
 @pytest.mark.slow
 def test_touching_cubes_cannot_be_grasped():
     """Claim: of exhaustive grasps of 3 x 3 touching cubes at most 3 % lift; of a hand that presses
@@ -286,10 +264,3 @@ def test_a_double_grasp_takes_both():
     after = jax.jit(env.step)(state, Action.grasp(0.0, 0.0, 0.0))
     assert after.info.cleared == 2
     assert after.info.outcome == Outcome.LIFTED
-
-
-@pytest.mark.parametrize("force", [0.0, -1.0, float("nan")])
-def test_a_force_is_above_0(force: float):
-    """Claim: a force that is no force is one line."""
-    with pytest.raises(SettingsError, match=r"sim\.down_force: must be above 0"):
-        SimConfig(down_force=force)

@@ -1,6 +1,5 @@
 """Actions among objects of a library: what moves them, and the planner that reads their poses."""
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -64,12 +63,6 @@ def test_scenes_of_a_batch_have_their_own_objects(env: Env, stepped):
     for name in ("position", "quaternion"):
         theirs = np.asarray(getattr(other.scene, name))
         np.testing.assert_array_equal(np.asarray(getattr(after.scene, name))[order], theirs)
-
-
-def test_objects_need_a_library():
-    """Claim: objects without a library are refused by setting."""
-    with pytest.raises(ValueError, match=r"scene\.objects: slots of kind object need a library"):
-        dataclasses.replace(CONFIG.scene, objects="")
 
 
 def _grasp(env: Env, scene: SceneState) -> tuple:

@@ -17,19 +17,6 @@ def _points(varied: list[str]) -> list[grid.SweepPoint]:
     return grid.points(varied, lambda flags: flags)
 
 
-def test_every_combination():
-    """Claim: every combination of the values, the last name's changing fastest, each with the flags
-    of the parser."""
-    found = _points(["replay.sampler=uniform,beta", "learn.learning-rate=1e-3,-1"])
-    assert [point.values for point in found] == [
-        {"replay.sampler": sampler, "learn.learning_rate": rate}
-        for sampler in ("uniform", "beta")
-        for rate in ("1e-3", "-1")
-    ]
-    assert found[1].name == "replay.sampler=uniform,learn.learning_rate=-1"
-    assert found[1].cfg == ["--replay.sampler", "uniform", "--learn.learning-rate", "-1"]
-
-
 def test_kinds_of_values():
     """Claim: colons separate the items of a tuple, switches are true or false, the algorithm is
     varied by its name; with nothing to vary there is one point."""

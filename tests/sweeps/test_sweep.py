@@ -218,21 +218,6 @@ def test_run_without_a_finite_loss_is_given_up(uninterrupted, tmp_path: Path):
     assert test_loop._log(folder / "a" / "seed-5") == test_loop._log(before)
 
 
-def test_bad_folders(tmp_path: Path):
-    """Claim: a folder that exists is left alone, one without a sweep or with a damaged one cannot
-    be resumed; two points of the same config are refused."""
-    with pytest.raises(FileExistsError):
-        _run(tmp_path, Listener())
-    assert list(tmp_path.iterdir()) == []
-    for content, message in ((None, r"no sweep\.json"), ("{", "cannot be read")):
-        if content:
-            (tmp_path / "sweep.json").write_text(content)
-        with pytest.raises(SweepError, match=message):
-            runner.read_plan(tmp_path)
-    with pytest.raises(SettingsError, match="same values"):
-        runner.groups_of(SweepPlan(1, [_point("a"), _point("b")]))
-
-
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sweep that was stopped in its second group."""

@@ -3,9 +3,7 @@
 import functools
 import json
 import math
-import re
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +13,7 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.config import Config, TrainConfig
-from csac_jax.errors import SettingsError
 from csac_jax.io import checkpoint, configs
-from csac_jax.io.checkpoint import CheckpointError
 from csac_jax.runtime.signals import Stop
 from csac_jax.training import loop
 from csac_jax.training.callbacks import Record, Summary
@@ -206,32 +202,12 @@ def test_loss_of_the_warm_up_does_not_count(tmp_path: Path):
 
 
 def test_warnings_come_once(tmp_path: Path):
-    """Claim: physics that fails again and again is logged once, a single failure not at all; the
-    build of Warp's kernels is announced, and that MJX compiles long on a CPU."""
-    mjx = CFG.change(sim={"physics": "mjx"})
-    warp = CFG.change(scene={"size_jitter": (0.1, 0.0)}, sim={"physics": "warp"})
-    cases: Any = (
-        ("many", Fake(ill_from=5), CFG, "physics failed", 1),
-        ("one", Fake(ill_from=5, ill_to=6), CFG, "physics failed", 0),
-        ("warp", Fake(), warp, "Warp builds its kernels", 1),
-        ("mjx", Fake(), mjx, "Warp builds its kernels", 0),
-        ("slow", Fake(), mjx, "MJX compiles for minutes on a CPU", 1),
-    )
-    for name, fake, cfg, text, times in cases:
+    """Claim: physics that fails again and again is logged once, a single failure not at all."""
+    for last, times in ((99, 1), (6, 0)):
         listener = Listener()
-        _run(tmp_path / name, listener, fake, cfg=cfg)
-        assert sum(text in line for line in listener.said) == times, name
-        counted = sum(record.physics_diverged for record in listener.records)
-        assert name != "one" or counted == 1
-
-
-def test_bad_folders(tmp_path: Path):
-    """Claim: a new run never writes into a folder that exists; one without a checkpoint cannot be
-    resumed."""
-    for resume, error in ((False, FileExistsError), (True, CheckpointError)):
-        with pytest.raises(error):
-            _run(tmp_path, Listener(), Fake(), resume=resume)
-        assert resume or list(tmp_path.iterdir()) == []
+        _run(tmp_path / f"{last}", listener, Fake(ill_from=5, ill_to=last))
+        assert sum("physics failed" in line for line in listener.said) == times
+        assert sum(record.physics_diverged for record in listener.records) == min(last, 24) - 5
 
 
 @pytest.mark.parametrize("stop_after", [3, None])
@@ -249,29 +225,6 @@ def test_resumed_with_more_actions_ends_as_the_longer_run(tmp_path: Path, stop_a
     assert _log(run_dir) == _log(tmp_path / "whole")
     assert checkpoint.load_config(run_dir) == LONGER
     assert configs.from_dict(json.loads((run_dir / "config.json").read_text())) == LONGER
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"learn": {"tau": 0.5}, "train": {"actions": 96}}, "learn.tau"),
-        ({"train": {"actions": 60}}, "train.actions"),
-        ({"train": {"actions": 96, "save_every": 3}}, "train.save_every"),
-        ({"seed": 6, "replay": {"sampler": "uniform"}}, "seed, replay.sampler, replay.rank_by"),
-    ],
-)
-def test_resume_needs_the_same_config(tmp_path: Path, changes: dict[str, Any], named: str):
-    """Claim: a run is resumed with its own config and no fewer actions; the message names, in one
-    line, what differs, and the run is left as it was."""
-    run_dir = tmp_path / "run"
-    _run(run_dir, Listener(1), Fake())
-    before = _final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()
-    fake = Fake()
-    with pytest.raises(SettingsError, match=rf"other values of {re.escape(named)}") as caught:
-        _run(run_dir, Listener(), fake, resume=True, cfg=CFG.change(**changes))
-    assert "\n" not in str(caught.value)
-    assert fake.compiled == []
-    assert (_final(run_dir), _log(run_dir), (run_dir / "config.json").read_text()) == before
 
 
 def test_success_is_over_the_last_200_grasps():

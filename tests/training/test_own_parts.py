@@ -14,7 +14,6 @@ import pytest
 import csac_jax as csac
 from csac_jax import presets
 from csac_jax.errors import DataWarning, SettingsError
-from csac_jax.io import configs
 from csac_jax.training import own_parts
 from csac_jax.training.own_parts import OwnParts
 
@@ -89,21 +88,6 @@ def test_name_has_what_a_part_was_made_with():
     assert own_parts.name(Net()).startswith(f"{__name__}.Net(width=4, stride=2) @")
     assert OwnParts(Mine(), Net()).names() == f"sampler {one}; network {own_parts.name(Net())}"
     assert OwnParts().names() == ""
-
-
-def test_config_has_the_names():
-    """Claim: a config with parts of its own survives its file; one without is as earlier versions
-    wrote it. Other parts than its own are refused in one line."""
-    cfg = own_parts.named(presets.smoke(), OwnParts(Mine()))
-    assert cfg.parts == f"sampler {own_parts.name(Mine())}"
-    assert configs.from_dict(configs.to_dict(cfg)) == cfg
-    assert "parts" not in configs.to_dict(presets.smoke())
-    assert own_parts.named(cfg, OwnParts(Mine())) == cfg
-    for other in (OwnParts(), OwnParts(Mine(share=0.5)), OwnParts(Mine(), Net())):
-        with pytest.raises(
-            SettingsError, match=r"^parts: these settings are of a run with sampler"
-        ):
-            own_parts.named(cfg, other)
 
 
 @pytest.mark.parametrize(

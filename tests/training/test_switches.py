@@ -49,12 +49,6 @@ def test_rewards_follow_their_source(algo: str):
     assert np.any(_paid(sensed, _after(TRUE, SENSED))[0] != _paid(truth, _after(TRUE, SENSED))[0])
 
 
-def test_what_is_not_sensed_costs_nothing():
-    """Claim: rewards by sensors refuse a cost that only the simulator knows."""
-    with pytest.raises(ValueError, match=r"^reward\.lost_block_penalty: must be 0 where"):
-        presets.smoke().change(reward={"outcome_source": "sensors", "lost_block_penalty": 1.0})
-
-
 @pytest.mark.slow
 @pytest.mark.mjx
 def test_switches_combine():

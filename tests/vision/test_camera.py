@@ -1,7 +1,5 @@
 """The pinhole camera's geometry."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,19 +35,3 @@ def test_points_project_to_their_pixels(scale):
     # A pixel covers [i - 1/2, i + 1/2): scaling moves pixel centres accordingly.
     np.testing.assert_allclose((x / z * 600.0 + 330.5) * scale - 0.5, col, atol=2e-3)
     np.testing.assert_allclose((y / z * 620.0 + 236.5) * scale - 0.5, row, atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("share", "change", "message"),
-    [
-        (1.0, {"size": (320, 240)}, "camera.centre: .* give the camera.size"),
-        (1.0, {"focal": (618.0, 300.0)}, "camera.focal"),
-        (1.0, {"size": (4, 4), "centre": (1.5, 1.5)}, "camera.size: must be at least 8"),
-        (1.0, {"position": (0.0, 0.0, 0.7)}, "camera.position"),
-        (0.3331, {}, "camera: .*whole"),
-    ],
-)
-def test_wrong_intrinsics_are_refused(share, change, message):
-    """Claim: intrinsics of another image size, nonsense, and parts of pixels are refused."""
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(CameraConfig(), **change).scaled(share)

@@ -7,7 +7,6 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.vision import camera, heightmap, observe, raycast
-from csac_jax.vision.heightmap import Observation
 
 CFG = HeightmapConfig(64, view="oblique")
 _EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
@@ -68,28 +67,3 @@ def test_the_view_agrees_with_numpy(reference):
     np.testing.assert_array_equal(obs.colour, colour)
     np.testing.assert_array_equal(obs.target, np.where(empty, False, np.asarray(tables[1])[row]))
     assert np.asarray(obs.target).any()
-
-
-@jax.jit
-def _views(polytopes: raycast.Polytopes, eye: camera.Camera) -> tuple[Observation, Observation]:
-    """From above, and by a camera; any block will do."""
-    tables = observe.surface_tables(polytopes, jnp.ones(len(polytopes.offset), bool))
-    hits = camera.cast_rays(eye, raycast.cast_polytopes, polytopes)
-    above = observe.ortho(CFG, observe.Shapes(polytopes), tables)
-    return above, observe.from_pixels(CFG, eye, hits, tables)
-
-
-def test_both_views_agree_where_the_camera_sees(reference):
-    """Claim: away from edges, cells that the camera sees are as high as from above, to a cell's
-    slope; the rest is empty; if any block is wanted, the target mask is all ones."""
-    above, beside = jax.device_get(_views(reference.polytopes, _EYE))
-    filled = beside.colour.sum(-1) > 0.0
-    windows = np.lib.stride_tricks.sliding_window_view(above.height, (3, 3))
-    flat = np.abs(above.height[1:-1, 1:-1, None, None] - windows)
-    flat = np.pad(flat.max((2, 3)) < 0.004, 1)
-    assert (filled & flat).mean() > 0.5
-    off = np.abs(beside.height - above.height)[filled & flat]
-    assert off.max() < 0.004
-    assert np.median(off) < 1e-4
-    assert np.all(beside.height[~filled] == 0.0)
-    assert np.all(beside.target)

@@ -199,21 +199,3 @@ def test_without_errors_there_is_no_randomness():
     assert "random" in str(jax.make_jaxpr(noisy.reset_to)(scene, jax.random.key(0)))
     with pytest.raises(ValueError, match=r"sensor.*key"):
         noisy.reset_to(scene)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sensor": {"dropped": 1.0}}, "sensor.dropped"),
-        ({"sensor": {"kind": "d415"}}, "sensor.kind: must be none where.*ortho"),
-        ({"sensor": {"intrinsics_noise": (0.0, 0.01)}}, "sensor.intrinsics_noise.*ortho"),
-        ({"sensor": {"kind": "d400"}}, "sensor.kind: 'd400' is not one of: none, d415"),
-        ({"heightmap": {"view": "side"}}, "heightmap.view"),
-        ({"heightmap": {"size": 60}}, "heightmap.size"),
-        ({"net": {"rotations": 202}}, "net.rotations: must be even, at most 200"),
-    ],
-)
-def test_bad_settings_are_refused(change: dict, message: str):
-    """Claim: impossible settings of sensor, view or yaws are refused by their name."""
-    with pytest.raises(ValueError, match=message):
-        Config().change(**change)

@@ -3,12 +3,10 @@
 import xml.etree.ElementTree
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from csac_jax.config import MESH_KINDS, SceneConfig, SimConfig
 from csac_jax.world import blocks, model
 
 CONVEX = [name for name in blocks.SHAPES if name != "arch"]
@@ -42,29 +40,3 @@ def test_half_spaces_are_those_of_the_hull(shape: str, scale: float):
     np.testing.assert_allclose(depth, (points @ hull[:, :3].T + hull[:, 3]).max(axis=1), atol=2e-6)
     present = offsets[0] < blocks.PADDING_OFFSET
     np.testing.assert_allclose(np.linalg.norm(normals[0], axis=1), present, atol=1e-6)
-
-
-def test_arch_is_a_block_with_a_tunnel():
-    """Claim: the arch is its bounding box less a tunnel along y, 50 mm wide and 25 mm high, open at
-    -z."""
-    half = _half("arch")
-    normals, offsets = map(np.asarray, blocks.half_spaces(("arch",), jnp.asarray(half[None])))
-    points = np.random.default_rng(0).uniform(-0.06, 0.06, (4000, 3))
-    inside = np.any((np.einsum("gfi,pi->pgf", normals, points) <= offsets).all(axis=2), axis=1)
-    tunnel = (np.abs(points[:, 0]) < 0.025) & (points[:, 2] < 0.0)
-    np.testing.assert_array_equal(inside, (np.abs(points) <= half).all(axis=1) & ~tunnel)
-
-
-@pytest.mark.parametrize("kind", MESH_KINDS)
-def test_compiler_keeps_the_origin_of_a_mesh(kind: str):
-    """Claim: a mesh block's pose in physics is that of its bounding box, although MuJoCo moves
-    meshes to their mass."""
-    compiled = model.build(SceneConfig(slots=(kind,), min_blocks=1), SimConfig()).model
-    geom, mesh = compiled.body("block0").geomadr[0], compiled.mesh(f"blocks/{kind}").id
-    start = compiled.mesh_vertadr[mesh]
-    vertices = compiled.mesh_vert[start : start + compiled.mesh_vertnum[mesh]]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, compiled.geom_quat[geom])
-    in_body = (vertices @ rotation.reshape(3, 3).T + compiled.geom_pos[geom]) / model.LARGEST
-    sets = (sorted(map(tuple, points.round(6) + 0.0)) for points in (_corners(kind, None), in_body))
-    np.testing.assert_allclose(*sets, atol=2e-6)

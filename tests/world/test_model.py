@@ -92,23 +92,6 @@ def test_block_fields_are_those_of_the_compiler(
         np.testing.assert_allclose(mine, reference, rtol=1e-5, atol=atol)  # float32
 
 
-def test_model_with_blocks_moves_as_a_compiled_one(
-    world: model.World, monkeypatch: pytest.MonkeyPatch
-):
-    """Claim: a world given block sizes afterwards moves as one that was compiled with them."""
-    scene = _scene(scale=0.9)
-    ends = []
-    written = model.with_blocks(world, _fields(world, scene))
-    for moved in (written, _compiled(monkeypatch, scene, 0.9)):
-        data = mujoco.MjData(moved)
-        data.qpos[world.block_qpos] = [0.0, 0.0, 0.06, np.cos(0.2), 0.0, np.sin(0.2), 0.0]
-        data.qpos[world.block_qpos[:, 0]] = 0.15 * np.arange(len(SLOTS)) - 0.4
-        data.qvel[world.block_dofs] = [0.3, 0.1, 0.0, 0.5, 1.0, -0.5]
-        mujoco.mj_step(moved, data, nstep=60)  # 0.24 s: fall, tumble, first contacts
-        ends.append(np.concatenate([data.qpos, data.subtree_com[world.block_bodies].ravel()]))
-    np.testing.assert_allclose(*ends, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("robot", "file", "old", "new", "says"),
     [

@@ -10,22 +10,6 @@ from csac_jax.scenes import cases
 from csac_jax.world import model, scene_state
 from tests.world import placed
 
-CUBE = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T
-
-
-@pytest.mark.parametrize(
-    ("second", "expected"),
-    [
-        (CUBE + np.array([1.5, 0.0, 0.3]), 0.5),  # face to face
-        (CUBE, 2.0),  # in one place: out through any face
-        (0.1 * CUBE + np.array([0.2, 0.0, 0.0]), 0.9),  # one inside the other
-        (CUBE + np.array([2.5, 0.0, 0.0]), -0.5),  # apart
-    ],
-)
-def test_depth_of_cubes(second: np.ndarray, expected: float):
-    """Claim: the depth is the shortest shift that parts them, below 0 where they are apart."""
-    assert cases.overlap(CUBE, second) == pytest.approx(expected)
-
 
 @pytest.mark.parametrize(
     "kinds", [("prism", "cylinder"), ("half_cylinder", "box"), ("prism", "prism"), ("box", "box")]

@@ -70,10 +70,3 @@ def test_parking_is_out_of_reach_and_out_of_view():
     assert pdist(place).min() > 2 * radius
     assert place[:, 0].min() > 0.5
     assert place[:, 2].min() - radius > VIEW_HEIGHT
-
-
-def test_inside_is_the_square():
-    """Claim: a block is inside while its centre lies above the workspace square, edges included."""
-    position = [[0.2, -0.2, 5.0], [0.201, 0.0, 0.0], [0.0, -0.201, 0.0], [-0.1, 0.1, -1.0]]
-    inside = scene_state.inside(jnp.array(position), 0.4)
-    np.testing.assert_array_equal(inside, [True, False, False, True])

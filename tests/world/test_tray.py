@@ -10,7 +10,7 @@ import pytest
 
 from csac_jax import presets
 from csac_jax.agent import maps
-from csac_jax.config import TRAY_WALL, Config, SceneConfig
+from csac_jax.config import TRAY_WALL, SceneConfig
 from csac_jax.constants import Primitive
 from csac_jax.env import Env, State
 from csac_jax.nets import networks
@@ -163,19 +163,3 @@ def test_scenes_settle_inside_the_tray(tmp_path, monkeypatch: pytest.MonkeyPatch
     )
     assert len(np.unique(xy.round(4), axis=0)) == 4
     assert env.any_yaw
-
-
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        ({"scene": {"tray": 0.44}}, r"scene\.tray: with its walls 0\.46 m, .*\.extent, 0\.448 m$"),
-        ({"scene": {"tray": 0.2}}, r"scene\.tray: at least scene\.drop_extent, 0\.248 m$"),
-        ({"scene": {"tray": 0.3, "packed_fraction": 0.5}}, r"scene\.packed_fraction: must be 0"),
-        ({"scene": {"tray": -0.1}}, r"scene\.tray: must be at least 0"),
-    ],
-)
-def test_a_tray_that_does_not_fit_is_one_line(change: dict, line: str):
-    """Claim: a tray that does not fit is refused with one line that names the setting."""
-    with pytest.raises(ValueError, match=line) as caught:
-        Config().change(**change)
-    assert "\n" not in str(caught.value)
