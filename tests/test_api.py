@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from csac_jax.agent import actor_critic, values
 from csac_jax.agent.actor_critic import LearnerState, Params
 from csac_jax.config import Config
 from csac_jax.errors import SettingsError
-from csac_jax.evaluation import monitor
+from csac_jax.evaluation import monitor, policies, suites
 from csac_jax.io import checkpoint, configs, files, policy_file
 from csac_jax.runtime import provenance
 from csac_jax.runtime.signals import Stop
@@ -40,6 +41,21 @@ def test_public_names_exist():
         assert getattr(csac_jax, name).__doc__, name
     assert set(csac_jax.__all__) < set(dir(csac_jax))
     assert not hasattr(csac_jax, "make_robot")
+
+
+def test_public_objects_have_short_texts(tiny: str):
+    """Claim: the text of a policy, an environment, a state, a suite or a run is one short line."""
+    env, learned = csac_jax.make_env(SMOKE), csac_jax.load_policy(tiny)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    objects = [env, csac_jax.AutoResetEnv(env), state, state.obs, learned]
+    objects += [kind(SMOKE) for kind in policies.BASELINES.values()]
+    objects += [csac_jax.deploy.CameraPolicy.load(tiny), policies.PlannerPolicy(SMOKE, learned)]
+    objects += [
+        suites.prepare(SMOKE, "in_distribution", 2),
+        api.Run(Path("run"), SMOKE, SUMMARY, {}),
+    ]
+    assert [text for text in map(repr, objects) if len(text) > 400 or "\n" in text] == []
+    assert re.search(r"params=<\d+ arrays, [\d,]+ numbers>", repr(learned))
 
 
 def _policy(path: Path, cfg: Config) -> Params:

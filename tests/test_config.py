@@ -6,9 +6,11 @@ import re
 
 import jax
 import pytest
+from tyro import _docstrings
 
-from csac_jax import presets, section
+from csac_jax import algorithms, presets, section
 from csac_jax.config import Config
+from csac_jax.io import configs
 
 NOT_FINITE = [math.inf, math.nan, 10**400]
 
@@ -186,3 +188,17 @@ def _fields() -> dict[str, tuple[type, dataclasses.Field]]:
 def test_at_most_110_settings():
     """Claim: there are at most 110 settings, those of all alternatives counted."""
     assert len(_fields()) <= 110
+
+
+def test_settings_that_no_preset_turns_say_whom_they_are_for():
+    """Claim: the text of a setting that no preset and no algorithm turns, or of its section, ends
+    with whom it is for; there are at most 24."""
+    turned = {"preset", "algo"}
+    for preset in map(presets.get, presets.PRESETS):
+        for algo in algorithms.ALGORITHMS:
+            turned |= set(configs.differences(Config(), algorithms.configure(preset, algo)))
+    kept = {name: of for name, of in _fields().items() if name not in turned}
+    assert 10 <= len(kept) <= 24
+    for name, (kind, field) in kept.items():
+        text = _docstrings.get_field_docstring(kind, field.name, ()) or ""
+        assert re.search(r"\bfor [\w` ,]+\)", f"{text} {kind.__doc__}"), name
