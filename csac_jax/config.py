@@ -5,7 +5,6 @@ others name their source. A `ClassVar` is a constant, no setting. A setting that
 algorithm turns ends with whom it is for: (for own cameras), (for the study).
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar, Literal, get_args
 
@@ -159,15 +158,6 @@ class CameraConfig(Section, section="camera"):
     position: tuple[float, float, float] = (-0.5, 0.0, 0.5)  # Position of the camera, m.
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Centre of the level view, m.
 
-    def scaled(self, share: float) -> "CameraConfig":
-        """Returns the same view with fewer pixels. Raises SettingsError unless they are whole."""
-        size = (round(self.size[0] * share), round(self.size[1] * share))
-        whole = math.dist(size, (self.size[0] * share, self.size[1] * share)) < 1e-6
-        require(whole, f"camera: {share} of {self.size} px is not a whole number of pixels")
-        focal = (self.focal[0] * share, self.focal[1] * share)
-        centre = ((self.centre[0] + 0.5) * share - 0.5, (self.centre[1] + 0.5) * share - 0.5)
-        return dataclasses.replace(self, size=size, focal=focal, centre=centre)
-
     def check(self) -> None:
         image = f"an image of {self.size[0]} x {self.size[1]} px"
         for side, focal, centre in zip(self.size, self.focal, self.centre, strict=True):
@@ -211,9 +201,8 @@ class HeightmapConfig(Section, section="heightmap"):
 
     size: int = number(64, 16, 1024)  # H = W, cells.
     extent: float = number(0.448, 0.1, 1.0)  # Side of the workspace, m (VPG; for own tables).
-    view: Literal["ortho", "oblique", "both"] = "ortho"
-    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras).
-    `both`: an episode has either, half and half."""
+    view: Literal["ortho", "oblique"] = "ortho"
+    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras)."""
 
     @property
     def cell(self) -> float:

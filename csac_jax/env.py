@@ -144,7 +144,7 @@ class Env:
             scene = scene.replace(grip=Grip(zero, zero))
         if self.cfg.scene.mixes_certified and scene.certified is None:
             scene = scene.replace(certified=no)
-        noise_key = sensor.episode_key(key, self.cfg)
+        noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, count)
         return State(scene, obs, zero, no, no, count, count, count, info, noise_key)
 
@@ -252,8 +252,7 @@ class Env:
         self, scene: SceneState, root: jax.Array | None, actions: jax.Array
     ) -> Observation:
         key = None if root is None else jax.random.fold_in(root, actions)
-        at_side = None if root is None else sensor.stands_at_side(root)
-        obs = observe.observe(self.cfg, scene, key, at_side)
+        obs = observe.observe(self.cfg, scene, key)
         if root is not None:
             obs = obs.replace(colour=sensor.grey(root, self.cfg.sensor, obs.colour))
         if not self.cfg.net.gripper:

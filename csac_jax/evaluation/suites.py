@@ -153,9 +153,8 @@ def prepare(
 def standard(cfg: Config, suite: str) -> Config:
     """Returns a policy's config with one world where it trained in many, for the suites of all.
 
-    A hand that varies becomes the RG2, a drawn grip the gripper's own, and of views from above and
-    aside the exact one from above is taken; its certified scenes are left out. `in_distribution`
-    keeps what training had.
+    A hand that varies becomes the RG2, a drawn grip the gripper's own; its certified scenes are
+    left out. `in_distribution` keeps what training had.
     """
     if suite == IN_DISTRIBUTION:
         return cfg
@@ -166,10 +165,7 @@ def standard(cfg: Config, suite: str) -> Config:
         low, high = getattr(cfg.sim, name)
         if low < high:
             world[name] = getattr(SimConfig, name)
-    cfg = cfg.change(sim=world, scene={"certified": SceneConfig.certified})
-    if cfg.heightmap.view != "both":
-        return cfg
-    return cfg.change(heightmap={"view": "ortho"}, sensor=SensorConfig())
+    return cfg.change(sim=world, scene={"certified": SceneConfig.certified})
 
 
 def check(suite: str) -> None:

@@ -124,6 +124,7 @@ def _nested(depth: int) -> Any:
         ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
         ("learn", {"tau": _nested(100_000)}, "learn: is nested too deeply"),
         ("net", {"kind": ["small"]}, "net.kind: "),
+        ("heightmap", {"view": "both"}, r"^heightmap\.view: input should be 'ortho' or 'oblique'"),
     ],
 )
 def test_bad_values_are_one_line(section: str, values: Any, message: str):
