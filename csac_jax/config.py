@@ -275,14 +275,14 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-    candidates: int = number(64, 1, 2**16)  # J, actions sampled in a round.
-    elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
+    start: ClassVar[str] = "both"  # of the first round: the actor's mean and the best cells
+    candidates: int = number(64, 4, 2**16)  # J, actions sampled in a round.
     rounds: int = number(3, 1, 1000)  # Rounds of sampling and fitting.
-    start: Literal["both", "actor", "cells"] = "both"
-    """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
 
-    def check(self) -> None:
-        require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
+    @property
+    def elites(self) -> int:
+        """Returns K, the number of best actions that the next round's distribution is fitted to."""
+        return max(4, self.candidates // 10)
 
 
 class PolicyConfig(Section, section="policy"):
@@ -411,11 +411,11 @@ class PrioritisedReplay(_AnyReplay):
 class BetaReplay(_AnyReplay):
     """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5."""
 
+    rank_by: ClassVar[str] = "error"  # what is largest at rank 0 (sec. 3.5)
+    start: ClassVar[Pair] = (0.5, 0.5)  # (a, b) at first (sec. 4.3)
+    middle: ClassVar[Pair] = (1.0, 1.0)  # on the way (sec. 3.5)
     middle_at: ClassVar[float] = 0.4  # share of all updates after which (a, b) is `middle` (ours)
     sampler: Literal["beta"] = "beta"  # Others: uniform, prioritised, opposite.
-    rank_by: Literal["error", "reward"] = "error"  # What is largest at rank 0 (for the study).
-    start: Pair = number((0.5, 0.5), 0.0, above=True)  # (a, b) at first (sec. 4.3; for the study).
-    middle: Pair = number((1.0, 1.0), 0.0, above=True)  # On the way (sec. 3.5; for the study).
     end: Pair = number((1.0, 12.0), 0.0, above=True)  # (a, b) in the end (CSAC sec. 4.3).
 
 

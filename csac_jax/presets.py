@@ -234,7 +234,7 @@ def smoke() -> Config:
         sim={"physics": "auto", "grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
-        cem={"candidates": 16, "elites": 4, "rounds": 2},
+        cem={"candidates": 16, "rounds": 2},
         learn={"batch": 8, "updates_per_step": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},

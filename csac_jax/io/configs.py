@@ -79,6 +79,21 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
+def former(cfg: Config) -> dict[str, Any]:
+    """Returns the constants of a config that were settings once, by their dotted names."""
+    sections = {name: getattr(cfg, name) for name in renames.FIXED}
+    return {
+        f"{name}.{field}": _constant(section, field)
+        for name, section in sections.items()
+        for field in sorted(renames.FIXED[name])
+        if hasattr(section, field)
+    }
+
+
+def _constant(section: Any, field: str) -> Any:
+    return json.loads(json.dumps(getattr(section, field)))
+
+
 def _validated(name: str, stored: Any) -> Any:
     if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
         sim = _validated(name, stored | {"gripper": SimConfig.gripper})
@@ -88,8 +103,8 @@ def _validated(name: str, stored: Any) -> Any:
     rest = {k: v for k, v in items if k not in fixed} if fixed else stored
     part = _parsed(kind, name, rest)
     for field, value in fixed.items():
-        today = getattr(part, field)
-        require(value == today, f"{name}.{field}: must be {today}, not {shown(value)}")
+        today = _constant(part, field)
+        require(value == today, f"{name}.{field}: must be {shown(today)}, not {shown(value)}")
     return part
 
 

@@ -72,7 +72,7 @@ def _preset_settings(preset: str, algo: str) -> Json:
     cfg = presets.get(preset)
     if algo in algorithms.ALGORITHMS:  # one that is gone is described by its settings
         cfg = algorithms.configure(cfg, algo)
-    return configs.flat(configs.to_dict(cfg))
+    return configs.former(cfg) | configs.flat(configs.to_dict(cfg))
 
 
 @functools.lru_cache(maxsize=64)  # runs of a folder mostly differ in their seed

@@ -90,13 +90,6 @@ def test_search_goes_on_where_no_score_was_found():
     assert np.mean(result.value == 1.0) > 0.8
 
 
-def test_start_must_fit():
-    """Claim: more starting points than candidates is an error that names the setting."""
-    cfg, key = CEMConfig(candidates=8), jax.random.key(0)
-    with pytest.raises(ValueError, match=r"cem\.candidates"):
-        cem.maximise(key, cfg, jnp.sum, jnp.zeros(3), jnp.zeros((9, 3)))
-
-
 @pytest.mark.parametrize(
     ("values", "valid", "mean", "yaw", "std"),
     [((0.1, 0.2, 0.6), 3, 0.3, 0.3, np.sqrt(0.14 / 3)),

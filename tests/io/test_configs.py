@@ -98,12 +98,21 @@ def test_former_settings_have_their_constants():
     wanted = Config().change(net={"stride": 4})
     assert configs.from_dict(number | stored) == wanted
     assert configs.from_dict(number | dense).net == DenseNet121()
-    for field, value, message in (
-        ("margin", 0.5, r"net\.pad_fraction: must be 0\.125, not 0\.5"),
-        ("zoom", 2, r"net\.upsample: unknown setting"),
+    rest = {
+        "cem": {"candidates": 16, "elites": 4, "start": "both"},
+        "replay": {"start": [0.5, 0.5]},
+    }
+    assert configs.from_dict(number | rest) == Config().change(cem={"candidates": 16})
+    for section, values, message in (
+        ("net", {"margin": 0.5}, r"net\.pad_fraction: must be 0\.125, not 0\.5"),
+        ("net", {"zoom": 2}, r"net\.upsample: unknown setting"),
+        ("cem", {"elites": 4}, r"cem\.elites: must be 6, not 4"),
+        ("replay", {"rank_by": "reward"}, r"replay\.rank_by: must be 'error', not 'reward'"),
+        ("replay", {"middle": [1, 2]}, r"replay\.middle: must be \[1\.0, 1\.0\], not \[1, 2\]"),
+        ("replay", {"sampler": "uniform", "middle": [1, 1]}, r"replay\.middle: unknown setting"),
     ):
         with pytest.raises(SettingsError, match=f"^{message}$"):
-            configs.from_dict(number | {"net": stored["net"] | {field: value}})
+            configs.from_dict(number | stored | {section: stored.get(section, {}) | values})
 
 
 def _nested(depth: int) -> Any:

@@ -257,7 +257,7 @@ def test_resumed_with_more_actions_ends_as_the_longer_run(tmp_path: Path, stop_a
         ({"learn": {"tau": 0.5}, "train": {"actions": 96}}, "learn.tau"),
         ({"train": {"actions": 60}}, "train.actions"),
         ({"train": {"actions": 96, "save_every": 3}}, "train.save_every"),
-        ({"seed": 6, "replay": {"sampler": "uniform"}}, "seed, replay.sampler, replay.rank_by"),
+        ({"seed": 6, "replay": {"sampler": "uniform"}}, "seed, replay.sampler, replay.end"),
     ],
 )
 def test_resume_needs_the_same_config(tmp_path: Path, changes: dict[str, Any], named: str):
