@@ -79,14 +79,26 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def former(cfg: Config) -> dict[str, Any]:
-    """Returns the constants of a config that were settings once, by their dotted names."""
-    sections = {name: getattr(cfg, name) for name in renames.FIXED}
-    return {
-        f"{name}.{field}": _constant(section, field)
-        for name, section in sections.items()
-        for field in sorted(renames.FIXED[name])
-        if hasattr(section, field)
+def recorded(values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a stored config by dotted name, and the former ones as it has them.
+
+    Other values of former settings, which `from_dict` refuses, are read: it is a record.
+    """
+    stored, former = renames.current(values), dict[str, Any]()
+    for name, fields in renames.FIXED.items():
+        section = stored.get(name)
+        if isinstance(section, dict):
+            former |= {f"{name}.{key}": section.pop(key) for key in fields & section.keys()}
+    return with_former(from_dict(stored)) | former
+
+
+def with_former(cfg: Config) -> dict[str, Any]:
+    """Returns the settings by dotted name, and constants of the config that were settings once."""
+    return flat(to_dict(cfg)) | {
+        f"{name}.{field}": _constant(getattr(cfg, name), field)
+        for name, fields in renames.FIXED.items()
+        for field in sorted(fields)
+        if hasattr(getattr(cfg, name), field)
     }
 
 

@@ -91,7 +91,8 @@ def test_old_names_are_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 def test_former_settings_have_their_constants():
     """Claim: a stored config or a user's file may hold a former setting at the value of today, and
-    is refused by its name with another value, or where the section never had it."""
+    is refused by its name with another value, or where the section never had it. A record's value
+    is read."""
     stored = {"net": {"kind": "small", "stride": 4, "margin": 0.125}}
     dense = {"net": {"kind": "densenet121", "zoom": 2, "pad_fraction": 0.4286}}
     number = {"format": configs.FORMAT}
@@ -113,6 +114,8 @@ def test_former_settings_have_their_constants():
     ):
         with pytest.raises(SettingsError, match=f"^{message}$"):
             configs.from_dict(number | stored | {section: stored.get(section, {}) | values})
+    settings = configs.recorded(number | {"cem": {"start": "actor"}})
+    assert (settings["cem.start"], settings["cem.elites"]) == ("actor", 6)
 
 
 def _nested(depth: int) -> Any:
