@@ -156,7 +156,7 @@ class Env:
         if self.cfg.task.has_target:
             one_lifted = (state.reward > 0.0) & (state.scene.target != scene_state.ANY)
             same_scene = one_lifted & jnp.any(state.scene.in_play) & ~self._certified(state.scene)
-            scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
+            scene = select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
 
     def step(self, state: State, action: Action) -> State:
@@ -190,7 +190,7 @@ class Env:
         blank = scene_state.parked(self.cfg.scene.slots)
         kept = {name: getattr(state.scene, name) for name in ("fingers", "grip", "certified")}
         blank = blank.replace(**kept)
-        return _select(valid, state.scene, blank), valid
+        return select(valid, state.scene, blank), valid
 
     def _judge(self, state: State, action: Action, motion: Motion) -> State:
         """Observes the scene that is left; counts actions, rewards and ends the episode."""
@@ -279,7 +279,7 @@ class AutoResetEnv:
         observation.
         """
         after = self.env.step(state, action)
-        return _select(after.done, self.env.auto_reset(key, after), after), after
+        return select(after.done, self.env.auto_reset(key, after), after), after
 
 
 def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | None = None) -> Env:
@@ -319,5 +319,6 @@ def _info(action: Action, motion: Motion, success: jax.Array, moved: jax.Array) 
     )
 
 
-def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """Returns the tree `yes` where the condition [] holds, else `no`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

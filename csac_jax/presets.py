@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from csac_jax.algorithms import unknown
 from csac_jax.config import Config, SceneConfig
-from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 _SHAPES = ("arch", "prism", "box", "cylinder", "half_cylinder")
 TEN_BLOCKS = Config().change(
@@ -265,13 +265,11 @@ def register(name: str, preset: Preset) -> None:
 
     Raises SettingsError if the name is taken.
     """
-    if name in PRESETS:
-        raise SettingsError(f"preset '{name}' exists; choose another name")
+    require(name not in PRESETS, f"preset '{name}' exists; choose another name")
     PRESETS[name] = preset
 
 
 def get(name: str) -> Config:
     """Returns the preset `name`. Raises SettingsError for an unknown name."""
-    if name not in PRESETS:
-        raise SettingsError(unknown("preset", name, PRESETS))
+    require(name in PRESETS, unknown("preset", name, PRESETS))
     return PRESETS[name]().change(preset=name)

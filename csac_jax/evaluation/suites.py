@@ -56,6 +56,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
 from csac_jax.runtime import short
 from csac_jax.scenes import arrange, cases, certify, constructions, pool
+from csac_jax.section import require
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, object_slots, scene_state
@@ -175,8 +176,7 @@ def check(suite: str) -> None:
     if not Path(suite).exists():
         known = ", ".join(SUITES)
         raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
-    if not _case_files(Path(suite)):
-        raise SettingsError(f"suite: {suite} holds no case file, NAME.json")
+    require(bool(_case_files(Path(suite))), f"suite: {suite} holds no case file, NAME.json")
 
 
 def _with_suite_task(cfg: Config, target: bool) -> Config:

@@ -138,8 +138,7 @@ def _parsed(kind: Any, name: str, stored: Any) -> Any:
 
 
 def _kind(name: str, stored: Any) -> Any:
-    if name not in names(Config):
-        raise SettingsError(f"{name}: unknown setting")
+    require(name in names(Config), f"{name}: unknown setting")
     tag, _ = ALTERNATIVES.get(name, ("", ()))
     if tag and isinstance(stored, dict) and tag in stored:
         return alternative_kind(name, stored[tag])
@@ -206,8 +205,7 @@ def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if path.suffix not in READERS:
-        raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
+    require(path.suffix in READERS, f"the name of a config file ends in {', '.join(READERS)}")
     kind, parse = READERS[path.suffix]
     text = reading.read_bytes(path, _LARGEST).decode()
     try:
@@ -216,8 +214,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise SettingsError("is nested too deeply") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         raise SettingsError(f"is no readable {kind} ({error})") from None
-    if not isinstance(content, dict):
-        raise SettingsError("must hold settings by name")
+    require(isinstance(content, dict), "must hold settings by name")
     return content
 
 
