@@ -5,7 +5,6 @@ others name their source. A `ClassVar` is a constant, no setting. A setting that
 algorithm turns ends with whom it is for: (for own cameras), (for the study).
 """
 
-import dataclasses
 import math
 from typing import Any, ClassVar, Literal, get_args
 
@@ -159,15 +158,6 @@ class CameraConfig(Section, section="camera"):
     position: tuple[float, float, float] = (-0.5, 0.0, 0.5)  # Position of the camera, m.
     look_at: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Centre of the level view, m.
 
-    def scaled(self, share: float) -> "CameraConfig":
-        """Returns the same view with fewer pixels. Raises SettingsError unless they are whole."""
-        size = (round(self.size[0] * share), round(self.size[1] * share))
-        whole = math.dist(size, (self.size[0] * share, self.size[1] * share)) < 1e-6
-        require(whole, f"camera: {share} of {self.size} px is not a whole number of pixels")
-        focal = (self.focal[0] * share, self.focal[1] * share)
-        centre = ((self.centre[0] + 0.5) * share - 0.5, (self.centre[1] + 0.5) * share - 0.5)
-        return dataclasses.replace(self, size=size, focal=focal, centre=centre)
-
     def check(self) -> None:
         image = f"an image of {self.size[0]} x {self.size[1]} px"
         for side, focal, centre in zip(self.size, self.focal, self.centre, strict=True):
@@ -211,9 +201,8 @@ class HeightmapConfig(Section, section="heightmap"):
 
     size: int = number(64, 16, 1024)  # H = W, cells.
     extent: float = number(0.448, 0.1, 1.0)  # Side of the workspace, m (VPG; for own tables).
-    view: Literal["ortho", "oblique", "both"] = "ortho"
-    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras).
-    `both`: an episode has either, half and half."""
+    view: Literal["ortho", "oblique"] = "ortho"
+    """`ortho`: cast from above, complete. `oblique`: points of `camera` (VPG; for own cameras)."""
 
     @property
     def cell(self) -> float:
@@ -286,14 +275,14 @@ class CEMConfig(Section, section="cem"):
 
     std: ClassVar[float] = 0.3  # of the first round, in half workspaces (x, y), half turns (ours)
     std_min: ClassVar[float] = 0.01  # least standard deviation of a round, in these units (ours)
-    candidates: int = number(64, 1, 2**16)  # J, actions sampled in a round.
-    elites: int = number(6, 2)  # K, best actions that the next round's distribution is fitted to.
+    start: ClassVar[str] = "both"  # of the first round: the actor's mean and the best cells
+    candidates: int = number(64, 4, 2**16)  # J, actions sampled in a round.
     rounds: int = number(3, 1, 1000)  # Rounds of sampling and fitting.
-    start: Literal["both", "actor", "cells"] = "both"
-    """First round: the actor's mean and the best cells; the mean; the best cell (for the study)."""
 
-    def check(self) -> None:
-        require(self.elites <= self.candidates, "cem.elites: must not exceed cem.candidates")
+    @property
+    def elites(self) -> int:
+        """Returns K, the number of best actions that the next round's distribution is fitted to."""
+        return max(4, self.candidates // 10)
 
 
 class PolicyConfig(Section, section="policy"):
@@ -422,11 +411,11 @@ class PrioritisedReplay(_AnyReplay):
 class BetaReplay(_AnyReplay):
     """CSAC-beta's replay: ranks by abs(TD error), rank / n ~ Beta(a, b), CSAC sec. 3.5."""
 
+    rank_by: ClassVar[str] = "error"  # what is largest at rank 0 (sec. 3.5)
+    start: ClassVar[Pair] = (0.5, 0.5)  # (a, b) at first (sec. 4.3)
+    middle: ClassVar[Pair] = (1.0, 1.0)  # on the way (sec. 3.5)
     middle_at: ClassVar[float] = 0.4  # share of all updates after which (a, b) is `middle` (ours)
     sampler: Literal["beta"] = "beta"  # Others: uniform, prioritised, opposite.
-    rank_by: Literal["error", "reward"] = "error"  # What is largest at rank 0 (for the study).
-    start: Pair = number((0.5, 0.5), 0.0, above=True)  # (a, b) at first (sec. 4.3; for the study).
-    middle: Pair = number((1.0, 1.0), 0.0, above=True)  # On the way (sec. 3.5; for the study).
     end: Pair = number((1.0, 12.0), 0.0, above=True)  # (a, b) in the end (CSAC sec. 4.3).
 
 

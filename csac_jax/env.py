@@ -144,7 +144,7 @@ class Env:
             scene = scene.replace(grip=Grip(zero, zero))
         if self.cfg.scene.mixes_certified and scene.certified is None:
             scene = scene.replace(certified=no)
-        noise_key = sensor.episode_key(key, self.cfg)
+        noise_key = sensor.episode_key(key, self.cfg.sensor)
         obs = self._observe(scene, noise_key, count)
         return State(scene, obs, zero, no, no, count, count, count, info, noise_key)
 
@@ -156,7 +156,7 @@ class Env:
         if self.cfg.task.has_target:
             one_lifted = (state.reward > 0.0) & (state.scene.target != scene_state.ANY)
             same_scene = one_lifted & jnp.any(state.scene.in_play) & ~self._certified(state.scene)
-            scene = _select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
+            scene = select(same_scene, scene_state.mark_target(key_target, state.scene), scene)
         return self.reset_to(scene, key)
 
     def step(self, state: State, action: Action) -> State:
@@ -190,7 +190,7 @@ class Env:
         blank = scene_state.parked(self.cfg.scene.slots)
         kept = {name: getattr(state.scene, name) for name in ("fingers", "grip", "certified")}
         blank = blank.replace(**kept)
-        return _select(valid, state.scene, blank), valid
+        return select(valid, state.scene, blank), valid
 
     def _judge(self, state: State, action: Action, motion: Motion) -> State:
         """Observes the scene that is left; counts actions, rewards and ends the episode."""
@@ -252,8 +252,7 @@ class Env:
         self, scene: SceneState, root: jax.Array | None, actions: jax.Array
     ) -> Observation:
         key = None if root is None else jax.random.fold_in(root, actions)
-        at_side = None if root is None else sensor.stands_at_side(root)
-        obs = observe.observe(self.cfg, scene, key, at_side)
+        obs = observe.observe(self.cfg, scene, key)
         if root is not None:
             obs = obs.replace(colour=sensor.grey(root, self.cfg.sensor, obs.colour))
         if not self.cfg.net.gripper:
@@ -280,7 +279,7 @@ class AutoResetEnv:
         observation.
         """
         after = self.env.step(state, action)
-        return _select(after.done, self.env.auto_reset(key, after), after), after
+        return select(after.done, self.env.auto_reset(key, after), after), after
 
 
 def make_env(cfg: Config, stream: int = pool.TRAIN_STREAM, num_scenes: int | None = None) -> Env:
@@ -320,5 +319,6 @@ def _info(action: Action, motion: Motion, success: jax.Array, moved: jax.Array) 
     )
 
 
-def _select(condition: jax.Array, yes: Any, no: Any) -> Any:
+def select(condition: jax.Array, yes: Any, no: Any) -> Any:
+    """Returns the tree `yes` where the condition [] holds, else `no`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from csac_jax.algorithms import unknown
 from csac_jax.config import Config, SceneConfig
-from csac_jax.errors import SettingsError
+from csac_jax.section import require
 
 _SHAPES = ("arch", "prism", "box", "cylinder", "half_cylinder")
 TEN_BLOCKS = Config().change(
@@ -234,7 +234,7 @@ def smoke() -> Config:
         sim={"physics": "auto", "grasp_phases": (20, 15, 20), "geom_pairs": 6, "contacts": 16},
         heightmap={"size": 32},
         net={"rotations": 4, "growth": 4, "dilations": (1, 2), "stem": 4, "head": 4},
-        cem={"candidates": 16, "elites": 4, "rounds": 2},
+        cem={"candidates": 16, "rounds": 2},
         learn={"batch": 8, "updates_per_step": 1},
         replay={"capacity": 64},
         train={"scenes": 2, "actions": 64, "learning_starts": 8, "chunk": 4, "save_every": 2},
@@ -265,13 +265,11 @@ def register(name: str, preset: Preset) -> None:
 
     Raises SettingsError if the name is taken.
     """
-    if name in PRESETS:
-        raise SettingsError(f"preset '{name}' exists; choose another name")
+    require(name not in PRESETS, f"preset '{name}' exists; choose another name")
     PRESETS[name] = preset
 
 
 def get(name: str) -> Config:
     """Returns the preset `name`. Raises SettingsError for an unknown name."""
-    if name not in PRESETS:
-        raise SettingsError(unknown("preset", name, PRESETS))
+    require(name in PRESETS, unknown("preset", name, PRESETS))
     return PRESETS[name]().change(preset=name)

@@ -21,7 +21,8 @@ STUDY = RESULTS / "study"
 ABOUT = "about.json"
 COMMANDS = (
     "Commands of benchmarks are those of the record's commit: settings and benchmarks may have had "
-    "other names then. Commands of runs and evaluations are those of today."
+    "other names then. Commands of runs and evaluations are those of today, with the settings that "
+    "have become constants."
 )
 
 

@@ -1,7 +1,9 @@
-"""Sections of a config with other constants than those of their class."""
+"""Sections of a config with other constants than those of their class; a camera of fewer pixels."""
 
 import dataclasses
 from typing import Any
+
+from csac_jax.config import CameraConfig
 
 
 def with_constants(section: Any, **constants: Any) -> Any:
@@ -11,3 +13,12 @@ def with_constants(section: Any, **constants: Any) -> Any:
     fields = {field.name: getattr(section, field.name) for field in dataclasses.fields(section)}
     assert not constants.keys() & fields.keys(), constants
     return type(kind.__name__, (kind,), constants)(**fields)
+
+
+def scaled(cfg: CameraConfig, share: float) -> CameraConfig:
+    """The same view with a share of the pixels along each side."""
+    (width, height), (x, y) = cfg.size, cfg.centre
+    size = (round(width * share), round(height * share))
+    focal = (cfg.focal[0] * share, cfg.focal[1] * share)
+    centre = ((x + 0.5) * share - 0.5, (y + 0.5) * share - 0.5)
+    return dataclasses.replace(cfg, size=size, focal=focal, centre=centre)

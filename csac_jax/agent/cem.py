@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from csac_jax.agent import box
 from csac_jax.config import CEMConfig
-from csac_jax.errors import SettingsError
 
 Score = Callable[[jax.Array], jax.Array]  # of a point of the box [3] -> []
 
@@ -35,10 +34,8 @@ def maximise(
     mu' = mean(elites), sigma' = max(std(elites), std_min), elites = best K of J samples, lines
     8-12; numbers as QT-Opt, arXiv:1806.10293. Deviations from line 13: the result is the best
     sample of all rounds, and the caller adds noise. NaN and -inf are never elites. `mean` [3] is
-    the actor's proposal, `start` [P0, 3] the first samples of the first round, P0 <= J.
+    the actor's proposal, `start` [P0, 3] the first samples of the first round.
     """
-    if len(start) > cfg.candidates:
-        raise SettingsError(f"cem.candidates: must be at least {len(start)}, the starting points")
     centre = box.project(mean)
     nothing = CEMResult(centre, jnp.full((), -jnp.inf, mean.dtype), centre[None])
     search = _Search(centre, jnp.full_like(mean, cfg.std), nothing)

@@ -47,8 +47,7 @@ def _cem(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResul
     cells = maps.best_cells(state.q[0], state.valid[0], cfg.elites)
     start = jax.vmap(maps.cell_point, (None, 0))(frames, cells)
     mean = maps.normalise(frames, actor.pose(frames, state, 0))
-    mean = start[0] if cfg.start == "cells" else mean
-    return cem.maximise(key, cfg, score, mean, start[:0] if cfg.start == "actor" else start)
+    return cem.maximise(key, cfg, score, mean, start)
 
 
 def _best_cell(key: jax.Array, learner: ActorCritic, state: DenseMaps) -> cem.CEMResult:

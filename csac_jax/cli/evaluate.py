@@ -25,7 +25,7 @@ TABLE = "table.md"  # in the folder --out
 
 
 @dataclasses.dataclass(frozen=True)
-class EvalOptions:
+class EvalOptions(settings.DecisionOptions):
     """Measures a policy in scenes that training never saw, with its own view and gripper."""
 
     source: tyro.conf.Positional[str]
@@ -54,12 +54,6 @@ class EvalOptions:
     """Physics engine: MJX, C MuJoCo, or auto: C MuJoCo on a CPU, else MJX."""
     robot: Literal["hand", "ur5", "ur5e"] = "hand"
     """Carrier of the gripper: none, it floats as in training; or an arm."""
-    augment: Literal["on", "off"] | None = None
-    """Decide by the mean Q over mirror images of the view; by default as the policy does."""
-    height_bonus: float | None = None
-    """Q that each metre of the surface under a cell adds; by default the policy's."""
-    retry_temperature: float | None = None
-    """Temperature of the draw of another place after failed grasps; by default the policy's."""
     episodes: int | None = None
     """Episodes of every part of a suite; by default 50, with --out the suite's own number."""
     share: float = 1.0
@@ -78,7 +72,7 @@ def run(arguments: list[str]) -> int:
     _check(options)
     if (Path(options.source) / files.SWEEP_PLAN).exists():
         return _evaluate_sweep(options, view)
-    changes = {**view, "policy": settings.decision(options)}
+    changes = {**view, "policy": options.decision}
     if options.out is not None:
         return _measure_all(options, changes, options.out)
     (suite,) = options.suites

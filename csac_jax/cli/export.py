@@ -15,7 +15,7 @@ from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ExportOptions(PolicyOptions):
+class ExportOptions(PolicyOptions, settings.DecisionOptions):
     """Writes a policy, networks and config, into one file.
 
     Settings of view and hand, such as --sim.gripper and --sensor.dropped, go into its config: a
@@ -27,18 +27,9 @@ class ExportOptions(PolicyOptions):
     format: Literal["safetensors", "stablehlo", "onnx"] = "safetensors"
     """safetensors: a policy file for the other commands. stablehlo: a program that jax runs alone.
     onnx: one that onnxruntime runs alone, of the small net; it takes the best cell."""
-    augment: Literal["on", "off"] | None = None
-    """Takes the mean of Q over mirror images of the view, see `policy.augment` of `csac-jax train
-    --help-all`; by default as the policy's."""
     average: str | None = None
     """Another policy, with the same networks and trained from the same start, such as the start
     itself. Each number of the networks is the mean of both policies' (Wortsman et al. 2022)."""
-    height_bonus: float | None = None
-    """Q's increase per metre of the surface under a cell, see `policy.height_bonus` of `csac-jax
-    train --help-all`; by default as the policy's."""
-    retry_temperature: float | None = None
-    """Temperature of the draw of another place after failed grasps, see `csac-jax train
-    --help-all`; by default as the policy's."""
     card: tuple[Path, ...] = ()
     """Results of `eval`, files or folders of them, for a model card, README.md beside the file. Its
     head is the `model-index` that model hubs read; change the licence there if it is not yours."""
@@ -59,7 +50,7 @@ def run(arguments: list[str]) -> int:
 
     evaluated = model_card.read(options.card) if options.card else []
     policy = deploy.CameraPolicy.load(options.policy, gripper=options.gripper)
-    cfg = policy.cfg.change(**view, policy=settings.decision(options))
+    cfg = policy.cfg.change(**view, policy=options.decision)
     params = policy.params if options.average is None else _mean(policy.params, options.average)
     if options.format == "safetensors":
         policy_file.save(options.file, params, cfg)

@@ -8,7 +8,6 @@ from typing import Any
 
 import tyro
 
-from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
 from csac_jax.cli.failures import check_extra, check_seed
 from csac_jax.cli.parsing import PROGRAM
@@ -67,13 +66,8 @@ class ShowOptions:
 
 def run(arguments: list[str]) -> int:
     """Runs one of the commands; returns the exit code."""
-    name, *rest = arguments or [""]
-    if name in ("", *parsing.SHORT_HELP):
-        known = ", ".join(COMMANDS)
-        print(f"usage: {PROGRAM} objects COMMAND ..., with COMMAND one of: {known}")
-        return 0 if name else 2
-    require(name in COMMANDS, f"objects: {unknown('command', name, COMMANDS)}")
-    return COMMANDS[name](rest)
+    commands = {"make": _make, "import": _import, "show": _show}
+    return parsing.subcommand("objects", commands, arguments)
 
 
 def _make(arguments: list[str]) -> int:
@@ -185,6 +179,3 @@ def _list(objects: Any) -> None:
     wide = [row["name"] for row in rows if row["narrowest_mm"] >= opening]
     if wide:
         print(f"wider than the hand opens, {opening:g} mm: {', '.join(wide)}")
-
-
-COMMANDS = {"make": _make, "import": _import, "show": _show}

@@ -5,12 +5,13 @@ import contextlib
 import dataclasses
 import difflib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
+from csac_jax.algorithms import unknown
 from csac_jax.config import SimConfig
 from csac_jax.errors import SettingsError
 from csac_jax.grippers import Gripper
@@ -110,6 +111,19 @@ def _registry() -> Iterator[None]:
 
     with registry:
         yield
+
+
+def subcommand(
+    group: str, commands: Mapping[str, Callable[[list[str]], int]], arguments: list[str]
+) -> int:
+    """Runs the command of a group that the arguments name; returns the exit code."""
+    name, *rest = arguments or [""]
+    if name in ("", *SHORT_HELP):
+        known = ", ".join(commands)
+        print(f"usage: {PROGRAM} {group} COMMAND ..., with COMMAND one of: {known}")
+        return 0 if name else 2
+    require(name in commands, f"{group}: {unknown('command', name, commands)}")
+    return commands[name](rest)
 
 
 def asks_help(arguments: Sequence[str]) -> bool:

@@ -8,14 +8,13 @@ from typing import Any, Literal
 import tyro
 
 from csac_jax import presets
-from csac_jax.algorithms import unknown
 from csac_jax.cli import output, parsing
 from csac_jax.cli.failures import check_seed
-from csac_jax.cli.parsing import PROGRAM
 from csac_jax.config import SceneConfig, SlotKind
 from csac_jax.errors import SettingsError
 from csac_jax.io import files
 from csac_jax.runtime import processes
+from csac_jax.section import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,16 +38,11 @@ class CertifyOptions:
 
 def run(arguments: list[str]) -> int:
     """Runs the command; returns the exit code."""
-    name, *rest = arguments or [""]
-    if name in ("", *parsing.SHORT_HELP):
-        print(f"usage: {PROGRAM} scenes COMMAND ..., with COMMAND one of: certify")
-        return 0 if name else 2
-    if name != "certify":
-        raise SettingsError(f"scenes: {unknown('command', name, ('certify',))}")
-    return _certify(parsing.parse(CertifyOptions, rest, "scenes certify"))
+    return parsing.subcommand("scenes", {"certify": _certify}, arguments)
 
 
-def _certify(options: CertifyOptions) -> int:
+def _certify(arguments: list[str]) -> int:
+    options = parsing.parse(CertifyOptions, arguments, "scenes certify")
     _check(options)
     from csac_jax.evaluation import certification
     from csac_jax.scenes import certify, constructions
@@ -98,12 +92,10 @@ def _judge(_: Any, cfgs: Any, generator: str, seed: int, scene: Any) -> tuple[An
 
 def _check(options: CertifyOptions) -> None:
     check_seed(options.seed)
-    if not options.sources:
-        raise SettingsError("sources: give constructions, or a folder of case files")
-    if not (1 <= options.count <= 100_000 and 0 <= options.jobs <= 1024):
-        raise SettingsError("--count must lie in 1 .. 100000, --jobs in 0 .. 1024")
-    if options.out.suffix != ".npz":
-        raise SettingsError(f"--out: {options.out} must end in .npz")
+    require(bool(options.sources), "sources: give constructions, or a folder of case files")
+    fits = 1 <= options.count <= 100_000 and 0 <= options.jobs <= 1024
+    require(fits, "--count must lie in 1 .. 100000, --jobs in 0 .. 1024")
+    require(options.out.suffix == ".npz", f"--out: {options.out} must end in .npz")
     if options.physics == "warp":
         import jax
 
@@ -123,8 +115,7 @@ def _candidates(options: CertifyOptions) -> tuple[SceneConfig, list[tuple[str, i
         slots: tuple[SlotKind, ...] = ()
         for kind in typing.get_args(SlotKind):
             slots += (kind,) * max((c.slots.count(kind) for c in loaded.values()), default=0)
-        if not slots:
-            raise SettingsError(f"{first}: holds no case file")
+        require(bool(slots), f"{first}: holds no case file")
         seated = [(name, 0, cases.seat(case, slots)) for name, case in loaded.items()]
         return SceneConfig(slots=slots, min_blocks=1), seated
     known = {**constructions.TRAIN, **constructions.TEST}

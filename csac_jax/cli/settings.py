@@ -4,7 +4,7 @@ import dataclasses
 import inspect
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -49,6 +49,26 @@ class RunOptions:
     """Number that all randomness of the run follows from; of a sweep the first seed."""
     algo: str = "csac_beta"
     """Algorithm; settings given as options win over it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DecisionOptions:
+    """Settings of section `policy` that a policy may be used with, see `csac-jax train --help-all`;
+    by default its own."""
+
+    augment: Literal["on", "off"] | None = None
+    """Decide by the mean Q over mirror images of the view; by default as the policy does."""
+    height_bonus: float | None = None
+    """Q that each metre of the surface under a cell adds; by default the policy's."""
+    retry_temperature: float | None = None
+    """Temperature of the draw of another place after failed grasps; by default the policy's."""
+
+    @property
+    def decision(self) -> dict[str, Any]:
+        """Returns the settings that are given."""
+        augment = None if self.augment is None else self.augment == "on"
+        numbers = {name: getattr(self, name) for name in ("height_bonus", "retry_temperature")}
+        return {k: v for k, v in {**numbers, "augment": augment}.items() if v is not None}
 
 
 def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
@@ -180,11 +200,3 @@ def parse_view(
         name: {k: v for k, v in vars(getattr(given, name)).items() if f"__{name}.{k}" in named}
         for name in VIEW
     }
-
-
-def decision(options: Any) -> dict[str, Any]:
-    """Returns the settings of section `policy` that a command's options give."""
-    values = {name: getattr(options, name) for name in ("height_bonus", "retry_temperature")}
-    if options.augment is not None:
-        values["augment"] = options.augment == "on"
-    return {name: value for name, value in values.items() if value is not None}

@@ -106,7 +106,7 @@ def rollout(
     numbers, actions = np.full(places, _NONE), np.zeros(places, int)
     states = jax.tree.map(lambda leaf: leaf[np.zeros(places, int)], begun(np.zeros(few, int)))
     completed, ending = np.zeros(episodes, bool), np.zeros(episodes, np.int32)
-    tables, waiting = None, np.arange(episodes)
+    tables, shape, waiting = None, (episodes, env.cfg.task.max_actions), np.arange(episodes)
     while np.any(numbers != _NONE) or waiting.size:
         free = np.flatnonzero(numbers == _NONE)[: waiting.size]
         for some in np.split(free, np.arange(few, free.size, few)):
@@ -122,7 +122,7 @@ def rollout(
         over = numbers[busy & done]
         completed[over], ending[over] = terminated[busy & done], endings(env, states)[busy & done]
         left[over] = in_play[busy & done]
-        tables = tables or _blank(record, episodes, env.cfg.task.max_actions)
+        tables = tables or jax.tree.map(lambda leaf: np.zeros(shape, leaf.dtype), record)
         for table, leaf in zip(jax.tree.leaves(tables), jax.tree.leaves(record), strict=True):
             table[numbers[busy], actions[busy]] = leaf[busy]
         numbers, actions = np.where(busy & done, _NONE, numbers), actions + 1
@@ -136,10 +136,6 @@ def rollout(
 
 
 _NONE = -1  # number of the episode in a place that is free
-
-
-def _blank(record: Episodes, episodes: int, actions: int) -> Episodes:
-    return jax.tree.map(lambda leaf: np.zeros((episodes, actions), leaf.dtype), record)
 
 
 @jax.jit

@@ -56,6 +56,7 @@ from csac_jax.errors import SettingsError
 from csac_jax.objects.library import Split
 from csac_jax.runtime import short
 from csac_jax.scenes import arrange, cases, certify, constructions, pool
+from csac_jax.section import require
 from csac_jax.sim import backend, physics as simulation
 from csac_jax.vision import observe
 from csac_jax.world import model, object_slots, scene_state
@@ -153,9 +154,8 @@ def prepare(
 def standard(cfg: Config, suite: str) -> Config:
     """Returns a policy's config with one world where it trained in many, for the suites of all.
 
-    A hand that varies becomes the RG2, a drawn grip the gripper's own, and of views from above and
-    aside the exact one from above is taken; its certified scenes are left out. `in_distribution`
-    keeps what training had.
+    A hand that varies becomes the RG2, a drawn grip the gripper's own; its certified scenes are
+    left out. `in_distribution` keeps what training had.
     """
     if suite == IN_DISTRIBUTION:
         return cfg
@@ -166,10 +166,7 @@ def standard(cfg: Config, suite: str) -> Config:
         low, high = getattr(cfg.sim, name)
         if low < high:
             world[name] = getattr(SimConfig, name)
-    cfg = cfg.change(sim=world, scene={"certified": SceneConfig.certified})
-    if cfg.heightmap.view != "both":
-        return cfg
-    return cfg.change(heightmap={"view": "ortho"}, sensor=SensorConfig())
+    return cfg.change(sim=world, scene={"certified": SceneConfig.certified})
 
 
 def check(suite: str) -> None:
@@ -179,8 +176,7 @@ def check(suite: str) -> None:
     if not Path(suite).exists():
         known = ", ".join(SUITES)
         raise SettingsError(f"suite: '{suite}' is neither a case file nor one of: {known}")
-    if not _case_files(Path(suite)):
-        raise SettingsError(f"suite: {suite} holds no case file, NAME.json")
+    require(bool(_case_files(Path(suite))), f"suite: {suite} holds no case file, NAME.json")
 
 
 def _with_suite_task(cfg: Config, target: bool) -> Config:

@@ -79,6 +79,33 @@ def flat(values: dict[str, Any]) -> dict[str, Any]:
     return flat
 
 
+def recorded(values: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a stored config by dotted name, and the former ones as it has them.
+
+    Other values of former settings, which `from_dict` refuses, are read: it is a record.
+    """
+    stored, former = renames.current(values), dict[str, Any]()
+    for name, fields in renames.FIXED.items():
+        section = stored.get(name)
+        if isinstance(section, dict):
+            former |= {f"{name}.{key}": section.pop(key) for key in fields & section.keys()}
+    return with_former(from_dict(stored)) | former
+
+
+def with_former(cfg: Config) -> dict[str, Any]:
+    """Returns the settings by dotted name, and constants of the config that were settings once."""
+    return flat(to_dict(cfg)) | {
+        f"{name}.{field}": _constant(getattr(cfg, name), field)
+        for name, fields in renames.FIXED.items()
+        for field in sorted(fields)
+        if hasattr(getattr(cfg, name), field)
+    }
+
+
+def _constant(section: Any, field: str) -> Any:
+    return json.loads(json.dumps(getattr(section, field)))
+
+
 def _validated(name: str, stored: Any) -> Any:
     if name == "sim" and isinstance(stored, dict) and isinstance(stored.get("gripper"), dict):
         sim = _validated(name, stored | {"gripper": SimConfig.gripper})
@@ -88,8 +115,8 @@ def _validated(name: str, stored: Any) -> Any:
     rest = {k: v for k, v in items if k not in fixed} if fixed else stored
     part = _parsed(kind, name, rest)
     for field, value in fixed.items():
-        today = getattr(part, field)
-        require(value == today, f"{name}.{field}: must be {today}, not {shown(value)}")
+        today = _constant(part, field)
+        require(value == today, f"{name}.{field}: must be {shown(today)}, not {shown(value)}")
     return part
 
 
@@ -111,8 +138,7 @@ def _parsed(kind: Any, name: str, stored: Any) -> Any:
 
 
 def _kind(name: str, stored: Any) -> Any:
-    if name not in names(Config):
-        raise SettingsError(f"{name}: unknown setting")
+    require(name in names(Config), f"{name}: unknown setting")
     tag, _ = ALTERNATIVES.get(name, ("", ()))
     if tag and isinstance(stored, dict) and tag in stored:
         return alternative_kind(name, stored[tag])
@@ -179,8 +205,7 @@ def _changed(base: Config, values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if path.suffix not in READERS:
-        raise SettingsError(f"the name of a config file ends in {', '.join(READERS)}")
+    require(path.suffix in READERS, f"the name of a config file ends in {', '.join(READERS)}")
     kind, parse = READERS[path.suffix]
     text = reading.read_bytes(path, _LARGEST).decode()
     try:
@@ -189,8 +214,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise SettingsError("is nested too deeply") from None
     except (tomllib.TOMLDecodeError, json.JSONDecodeError) as error:
         raise SettingsError(f"is no readable {kind} ({error})") from None
-    if not isinstance(content, dict):
-        raise SettingsError("must hold settings by name")
+    require(isinstance(content, dict), "must hold settings by name")
     return content
 
 

@@ -7,7 +7,6 @@ from csac_jax.config import Config
 from csac_jax.errors import DataWarning
 
 TASKS = {"clear": "take all", "target": "get a marked one", "both": "take all, or get a marked one"}
-ABOVE = "maps from above"
 
 
 def task(cfg: Config) -> str:
@@ -31,19 +30,19 @@ def hand(cfg: Config) -> str:
 def view(cfg: Config) -> str:
     """Returns what a policy of this config sees."""
     if cfg.heightmap.view == "ortho":
-        return ABOVE
+        return "maps from above"
     noise = "exact" if cfg.sensor.kind == "none" else "noisy"
-    aside = f"{noise} images of an oblique camera"
-    return aside if cfg.heightmap.view == "oblique" else f"{ABOVE}, and {aside}"
+    return f"{noise} images of an oblique camera"
 
 
 def warn_if_elsewhere(made: Config, used: Config) -> None:
     """Warns, in one line, of a hand, view, task or objects that a policy was not trained with."""
-    same_hand = made.net.gripper or _fingers(made) == _fingers(used)
+    hands = (grippers.load(cfg.sim.gripper).fingers for cfg in (made, used))
+    same_hand = made.net.gripper or len(set(hands)) == 1
     mixed = len({kind == "object" for kind in made.scene.slots}) == 2
     pairs = {  # any will do, what was, what is
         "hand ": (same_hand, str(made.sim.gripper), str(used.sim.gripper)),
-        "view ": (made.heightmap.view == "both", view(made), view(used)),
+        "view ": (False, view(made), view(used)),
         "task ": (made.task.kind == "both", task(made), task(used)),
         "": (mixed, objects(made), objects(used)),
     }
@@ -55,7 +54,3 @@ def warn_if_elsewhere(made: Config, used: Config) -> None:
     if others:
         text = f"this policy was trained with {'; '.join(others)}: expect less of it"
         warnings.warn(f"{text}; csac-jax policies lists those that ship", DataWarning, stacklevel=3)
-
-
-def _fingers(cfg: Config) -> grippers.Fingers:
-    return grippers.load(cfg.sim.gripper).fingers

@@ -25,7 +25,11 @@ SETTINGS: dict[str, str | None] = {
 }
 """Settings by their dotted names; None: the setting is gone, whatever its value."""
 
-FIXED = {"net": {"pad_fraction", "upsample"}}
+FIXED = {
+    "cem": {"elites", "start"},
+    "net": {"pad_fraction", "upsample"},
+    "replay": {"middle", "rank_by", "start"},
+}
 """Former settings of each section, which must have the value of today's constant."""
 
 VALUES: dict[str, dict[str, str]] = {

@@ -228,12 +228,11 @@ class Prioritised(_Configured):
 
 
 class Beta(_Configured):
-    """rank / n ~ Beta(a, b), rank 0 the largest abs(TD error) or reward; CSAC sec. 3.5."""
+    """rank / n ~ Beta(a, b), rank 0 the largest abs(TD error); CSAC sec. 3.5."""
 
     def sample(self, key: jax.Array, state: ReplayState, progress: jax.Array, num: int) -> Sample:
         a, b = beta_schedule(self.cfg, progress)
-        values = state.priority if self.cfg.rank_by == "error" else state.items.reward
-        return Sample(beta_slots(key, values, state.size, a, b, num), jnp.ones(num))
+        return Sample(beta_slots(key, state.priority, state.size, a, b, num), jnp.ones(num))
 
 
 class Opposite(_Configured):

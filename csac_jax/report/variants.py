@@ -72,12 +72,12 @@ def _preset_settings(preset: str, algo: str) -> Json:
     cfg = presets.get(preset)
     if algo in algorithms.ALGORITHMS:  # one that is gone is described by its settings
         cfg = algorithms.configure(cfg, algo)
-    return configs.flat(configs.to_dict(cfg))
+    return configs.with_former(cfg)
 
 
 @functools.lru_cache(maxsize=64)  # runs of a folder mostly differ in their seed
 def _settings(text: str) -> Json:
-    return configs.flat(configs.to_dict(configs.from_dict(json.loads(text))))
+    return configs.recorded(json.loads(text))
 
 
 def world_settings(config: Json) -> dict[str, str]:

@@ -14,6 +14,7 @@ from csac_jax.config import MESH_KINDS, HeightmapConfig, SlotKind
 from csac_jax.errors import SettingsError
 from csac_jax.objects import tables
 from csac_jax.objects.library import LibraryError
+from csac_jax.section import require
 from csac_jax.world import blocks, object_slots, scene_state
 from csac_jax.world.scene_state import SceneState
 
@@ -116,8 +117,7 @@ def _case(content: "CaseFile", folder: Path) -> Case:
 
 def _with_objects(case: Case, entries: list["CaseBlock"], folder: Path) -> Case:
     name, *others = {entry.library for entry in entries if entry.library}
-    if others:
-        raise SettingsError(f"objects of {1 + len(others)} libraries; take all from one")
+    require(not others, f"objects of {1 + len(others)} libraries; take all from one")
     source = name if tables.PROCEDURAL.fullmatch(name) else str(folder / name)
     library, slots = tables.find(source, "all"), np.flatnonzero(blocks.is_object(case.slots))
     numbers = np.array([library.number(entries[slot].object or "") for slot in slots])
@@ -134,8 +134,7 @@ def _check_places(case: Case, extent: float) -> None:
     placed: list[list[np.ndarray]] = []  # corners of the parts of the blocks so far
     for number, parts in enumerate(_corners(case), 1):
         fault = _outside(np.concatenate(parts), extent) or _overlapping(parts, placed)
-        if fault:
-            raise SettingsError(f"block {number}: {fault}")
+        require(not fault, f"block {number}: {fault}")
         placed.append(parts)
 
 

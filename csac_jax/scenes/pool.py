@@ -24,8 +24,9 @@ import numpy as np
 from csac_jax import cache_folder
 from csac_jax.assets import assets
 from csac_jax.config import Config, SceneConfig, SlotKind
-from csac_jax.errors import SceneError, SettingsError
+from csac_jax.errors import SceneError
 from csac_jax.scenes import arrange, cases, certify, constructions, packings
+from csac_jax.section import require
 from csac_jax.world import blocks, model, object_slots, scene_state
 from csac_jax.world.model import BlockFields, World
 from csac_jax.world.scene_state import SceneState
@@ -117,8 +118,7 @@ def _certified(cfg: SceneConfig) -> SceneState:
     seated = []
     for name in cfg.certified:
         suite = constructions.SUITES[name]
-        if suite.tray != cfg.tray:
-            raise SettingsError(f"scene.tray: scenes of {name} need {suite.tray:g}")
+        require(suite.tray == cfg.tray, f"scene.tray: scenes of {name} need {suite.tray:g}")
         scenes = certify.load(certify.shipped(f"{name}-train")).scenes
         seated += _seated(name, suite.slots, scenes, cfg.slots)
     return _stack(seated)

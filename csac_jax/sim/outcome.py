@@ -11,7 +11,7 @@ from csac_jax.config import SimConfig
 from csac_jax.constants import Outcome
 
 LIFT_SHARE = 0.5  # a block counts as lifted when it rose by this share of the hand's rise
-STOPPED = 0.008  # m, a guarded descent that ends so far above its set-point was stopped (ours)
+STOPPED = 0.008  # m, a guarded descent that ends so far above its set-point met `down_force` (ours)
 GRIP_RISE = 0.01  # m, a held block that rose this far was grasped
 BARE = 0.01  # m, a surface lower than this is bare table
 CLOSED_GAP = 0.005  # m, a smaller finger gap is a closed hand
@@ -77,11 +77,6 @@ def trace_of(cfg: SimConfig, substeps: Substep) -> Trace:
 def lifted_blocks(trace: Trace, hand_rise: jax.Array) -> jax.Array:
     """Returns [N] bool, a block rose with the hand, by `hand_rise` [] m, which holds something."""
     return jnp.any(trace.held) & (trace.rise >= LIFT_SHARE * hand_rise)
-
-
-def is_stopped(trace: Trace, primitive: jax.Array) -> jax.Array:
-    """Returns [] bool, the hand met more than `sim.down_force` on a guarded way down."""
-    return trace.lag[primitive] > STOPPED
 
 
 def grasp_outcome(trace: Trace, surface: jax.Array, hand_rise: jax.Array) -> jax.Array:

@@ -143,8 +143,8 @@ def _judged(cfg: Config, started: Started, after: SceneState, trace: Trace) -> M
     after, trace, plan = _followed(started, after, trace)
     finite = jnp.all(jnp.isfinite(action.pose))  # C MuJoCo would continue
     diverged = ~(valid & finite & healthy(after))
-    guarded = cfg.sim.approach == "guarded"
-    blocked = guarded & outcome.is_stopped(trace, action.primitive) & ~diverged
+    stopped = trace.lag[action.primitive] > outcome.STOPPED
+    blocked = (cfg.sim.approach == "guarded") & stopped & ~diverged
     undone = diverged | blocked
     after = jax.tree.map(functools.partial(jnp.where, undone), scene, after)
     is_grasp = action.primitive == Primitive.GRASP

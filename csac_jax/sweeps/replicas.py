@@ -32,7 +32,7 @@ _TRACED = {
     "reward": "success_bonus grasp_levels push_levels lost_block_penalty",
     "explore": "noise_std epsilon_primitive epsilon_place epsilon_decay push_fraction",
     "learn": "learning_rate actor_learning_rate lr_final_fraction tau",
-    "replay": "start middle end",
+    "replay": "end",
 }
 TRACED_HYPERPARAMS = tuple(f"{key}.{name}" for key in _TRACED for name in _TRACED[key].split())
 """Settings that enter a program as numbers only: no shape and no branch depends on them."""

@@ -73,7 +73,8 @@ def _is_plain(value: Any) -> bool:
 
 
 def _digest(part: Any) -> str:
-    content = [_source(kind) for kind in type(part).__mro__ if not _is_library(kind)]
+    owners = {kind: kind.__module__.partition(".")[0] for kind in type(part).__mro__}
+    content = [_source(kind) for kind, owner in owners.items() if owner not in LIBRARIES]
     content += [f"{name}={_content(value)}" for name, value in _fields(part).items()]
     return hashlib.sha256("\n".join(content).encode()).hexdigest()[:12]
 
@@ -95,10 +96,6 @@ def _content(value: Any) -> str:
         array = np.asarray(value.__array__())
         return f"{array.dtype}{array.shape}{hashlib.sha256(array.tobytes()).hexdigest()}"
     return kind
-
-
-def _is_library(kind: type) -> bool:
-    return kind.__module__.partition(".")[0] in LIBRARIES
 
 
 def _source(of: Any) -> str:

@@ -84,7 +84,7 @@ by, leaves [E, ...], and if V of it is 0, [E] bool."""
 
 def where(condition: jax.Array, yes: Any, no: Any) -> Any:
     """Returns `yes` in the scenes where the condition [E] holds, else `no`; leaves [E, ...]."""
-    return jax.tree.map(lambda a, b: jax.vmap(jnp.where)(condition, a, b), yes, no)
+    return jax.vmap(environment.select)(condition, yes, no)
 
 
 def with_reward_outcome(cfg: RewardConfig, after: environment.State) -> environment.State:

@@ -2,8 +2,7 @@
 
 `HeightmapConfig.view` `ortho` is complete: one ray straight down per cell. `oblique` is the depth
 image of a camera at the side, its points projected along gravity as in VPG (arXiv:1803.09956);
-hidden cells are empty. `both` takes either for an episode. S = surfaces, see `raycast.SurfaceHit`,
-G = geoms, [h, w] = camera pixels.
+hidden cells are empty. S = surfaces, see `raycast.SurfaceHit`, G = geoms, [h, w] = camera pixels.
 """
 
 import math
@@ -45,28 +44,15 @@ class Shapes(NamedTuple):
         return 1 + self.blocks.offset.size
 
 
-def observe(
-    cfg: Config, scene: SceneState, key: jax.Array | None = None, at_side: jax.Array | None = None
-) -> Observation:
-    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`.
-
-    Where `cfg.heightmap.view` is `both`, `at_side` [] bool says whether the camera stands at the
-    side; None: it looks from above.
-    """
+def observe(cfg: Config, scene: SceneState, key: jax.Array | None = None) -> Observation:
+    """Observes one scene, leaves [H, W, ...]; exact, or with the noise of `cfg.sensor` by `key`."""
     shapes = scene_shapes(cfg.scene, scene)
     light: Any = camera.LIGHT
     if key is not None and cfg.sensor.light > 0.0:
         light = sensor.light(jax.random.fold_in(key, _LIGHT), cfg.sensor)
     tables = scene_tables(cfg.scene, scene, shapes, light)
-    if cfg.heightmap.view == "oblique":
-        return oblique(cfg, shapes, tables, key)
-    if cfg.heightmap.view == "ortho" or at_side is None:
-        return above(cfg, shapes, tables, key)
-    keys = [None, None] if key is None else jax.random.split(key)
-    views = [
-        look(cfg, shapes, tables, key) for look, key in zip((oblique, above), keys, strict=True)
-    ]
-    return jax.tree.map(lambda *views: jnp.where(at_side, *views), *views)
+    look = oblique if cfg.heightmap.view == "oblique" else above
+    return look(cfg, shapes, tables, key)
 
 
 def seen_share(cfg: SceneConfig, scene: SceneState) -> jax.Array:

@@ -10,26 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from csac_jax import geometry
-from csac_jax.config import CameraConfig, Config, SensorConfig
+from csac_jax.config import CameraConfig, SensorConfig
 from csac_jax.vision import camera, depth_camera
 from csac_jax.vision.camera import Camera
 
 GREY = 0.5  # level of a view without colours (ours), which the small net takes as 0
-_OWN, _SIDE = np.uint32(2**31), np.uint32(2**31 + 1)  # distinct from children by `split`
+_OWN = np.uint32(2**31)  # distinct from children by `split`
 _SRGB = 2.2  # exponent from a colour level to light, about that of sRGB
 
 
-def episode_key(key: jax.Array | None, cfg: Config) -> jax.Array | None:
-    """Returns an episode's root key of view and noise, or None where both are fixed.
-
-    Raises ValueError for a missing key.
-    """
-    if not cfg.sensor.active and cfg.heightmap.view != "both":
+def episode_key(key: jax.Array | None, cfg: SensorConfig) -> jax.Array | None:
+    """Returns an episode's root key of noise, or None without noise. Raises ValueError for a
+    missing key."""
+    if not cfg.active:
         return None
     if key is None:
-        raise ValueError(
-            "a reset with sensor noise (config section `sensor`), or with both views, needs a key"
-        )
+        raise ValueError("a reset with sensor noise (config section `sensor`) needs a key")
     return jax.random.fold_in(key, _OWN)
 
 
@@ -105,14 +101,6 @@ def light(key: jax.Array, cfg: SensorConfig) -> jax.Array:
     """Draws the unit vector [3] towards the light: that of `camera.shade`, turned a little."""
     towards = jnp.asarray(camera.LIGHT, jnp.float32) + cfg.light * jax.random.normal(key, (3,))
     return towards / jnp.sqrt(jnp.sum(towards**2))
-
-
-def stands_at_side(root: jax.Array) -> jax.Array:
-    """Draws [] bool, the camera stands at the side in all views of an episode, in half of them.
-
-    Args: root, of the episode, see `episode_key`.
-    """
-    return jax.random.bernoulli(jax.random.fold_in(root, _SIDE))
 
 
 def grey(root: jax.Array, cfg: SensorConfig, colour: jax.Array) -> jax.Array:

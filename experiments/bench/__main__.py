@@ -20,7 +20,6 @@ MAIN = {
     "start": ["quick", "--runs", "1"],
     "replay": ["--largest", "16"],
     "sweep": ["quick", "--seeds", "1", "4"],
-    "objects": [],
     "parity": ["--primitives", "64", "--poses", "8"],
 }
 """Benchmark -> its arguments."""
@@ -30,7 +29,6 @@ FIGURES = {
     "start": tuple(f"median.this.{part}" for part in PARTS),
     "replay": ("capacities.0.median_seconds.beta", "capacities.4.median_seconds.beta"),
     "sweep": ("rows.0.actions_per_second", "rows.1.actions_per_second"),
-    "objects": ("milliseconds.blocks action", "over_blocks.objects action"),
     "parity": ("piles_of_10.grasp_outcome_equal", "piles_of_10.push_effect_equal"),
 }
 """Benchmark -> places of its main figures."""

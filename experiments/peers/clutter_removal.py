@@ -26,7 +26,6 @@ ABOVE = 0.6  # m (ours), of the camera that looks straight down, over the table
 LOOKED_AT = 0.25  # m, height of the point that its oblique camera looks at, in its world
 DISTANCE = (2.0, 2.5)  # of that camera, over the side of the square
 POLAR, AZIMUTH = (np.pi / 4, np.pi / 3), (0.0, np.pi)  # rad, its direction from that point
-NOISE = 0.0008  # m, standard deviation of its points; ours of the depth
 UNUSED = ("open3d", "torch")  # it imports them for what an exam does not use
 
 

@@ -160,19 +160,10 @@ def _peaked(key: jax.Array, frames) -> DenseMaps:
     return DenseMaps(q, logits, jnp.broadcast_to(frames.inside, q.shape))
 
 
-@pytest.mark.parametrize(
-    ("start", "least", "most"),
-    [
-        ("both", 0.98, 1.0),
-        pytest.param("cells", 0.98, 1.0, marks=pytest.mark.slow),
-        pytest.param("actor", 0.0, 0.1, marks=pytest.mark.slow),
-    ],
-)
-def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts, start, least, most):
+def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts):
     """Claim: with the default settings, of 1,000 searches on maps of one to five peaks at least 98
-    % reach the highest value within 1 %, whatever the actor proposes; from an actor alone that
-    knows nothing of it, hardly one does."""
-    own = parts(cfg.change(cem=CEMConfig(start=start)))
+    % reach the highest value within 1 %, whatever the actor proposes."""
+    own = parts(cfg.change(cem=CEMConfig()))
 
     def reached(i: jax.Array) -> jax.Array:
         state = _peaked(jax.random.fold_in(jax.random.key(3), i), frames)
@@ -182,7 +173,7 @@ def test_search_finds_the_highest_of_several_peaks(cfg, frames, parts, start, le
         return value >= 0.99 * best
 
     share = np.mean(jax.jit(jax.vmap(reached))(jnp.arange(1000)))
-    assert least <= share <= most, share
+    assert share >= 0.98, share
 
 
 @pytest.mark.slow
@@ -191,7 +182,7 @@ def test_search_is_the_same_compiled_sooner(cfg, frames, parts):
 
     def search(i: jax.Array) -> jax.Array:
         keys = jax.random.split(jax.random.fold_in(jax.random.key(5), i))
-        state, both = _peaked(keys[0], frames), cfg.change(cem=CEMConfig(start="both"))
+        state, both = _peaked(keys[0], frames), cfg.change(cem=CEMConfig())
         return policy.greedy(keys[1], parts(both), state, jnp.int32(0)).values
 
     own = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}

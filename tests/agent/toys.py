@@ -128,7 +128,7 @@ def config(algo: str, actions: int, max_actions: int, push: float | None = None)
     small = Config(
         heightmap=HeightmapConfig(size=16),
         net=with_constants(net, pad_fraction=0.25),
-        cem=CEMConfig(candidates=16, elites=4, rounds=2),
+        cem=CEMConfig(candidates=16, rounds=2),
         target=with_constants(TargetConfig(), samples=16),
         explore=ExploreConfig(push_fraction=0.5, epsilon_place=(0.5, 0.1)),
         learn=LearnConfig(learning_rate=5e-3, batch=32, updates_per_step=2, tau=0.1),

@@ -25,11 +25,12 @@ from csac_jax.io import policy_file
 from csac_jax.runtime.signals import Stop
 from csac_jax.vision import heightmap
 from tests.deploy import scenes
+from tests.sections import scaled
 
 pytestmark = pytest.mark.optax
 
 CFG = presets.smoke().change(target={"gamma": 0.0}, learn={"augment": False})
-SMALL = CameraConfig().scaled(0.25)
+SMALL = scaled(CameraConfig(), 0.25)
 LEFT, RIGHT = (-0.1, 0.0), (0.1, 0.05)
 
 

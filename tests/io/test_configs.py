@@ -91,19 +91,31 @@ def test_old_names_are_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
 
 def test_former_settings_have_their_constants():
     """Claim: a stored config or a user's file may hold a former setting at the value of today, and
-    is refused by its name with another value, or where the section never had it."""
+    is refused by its name with another value, or where the section never had it. A record's value
+    is read."""
     stored = {"net": {"kind": "small", "stride": 4, "margin": 0.125}}
     dense = {"net": {"kind": "densenet121", "zoom": 2, "pad_fraction": 0.4286}}
     number = {"format": configs.FORMAT}
     wanted = Config().change(net={"stride": 4})
     assert configs.from_dict(number | stored) == wanted
     assert configs.from_dict(number | dense).net == DenseNet121()
-    for field, value, message in (
-        ("margin", 0.5, r"net\.pad_fraction: must be 0\.125, not 0\.5"),
-        ("zoom", 2, r"net\.upsample: unknown setting"),
+    rest = {
+        "cem": {"candidates": 16, "elites": 4, "start": "both"},
+        "replay": {"start": [0.5, 0.5]},
+    }
+    assert configs.from_dict(number | rest) == Config().change(cem={"candidates": 16})
+    for section, values, message in (
+        ("net", {"margin": 0.5}, r"net\.pad_fraction: must be 0\.125, not 0\.5"),
+        ("net", {"zoom": 2}, r"net\.upsample: unknown setting"),
+        ("cem", {"elites": 4}, r"cem\.elites: must be 6, not 4"),
+        ("replay", {"rank_by": "reward"}, r"replay\.rank_by: must be 'error', not 'reward'"),
+        ("replay", {"middle": [1, 2]}, r"replay\.middle: must be \[1\.0, 1\.0\], not \[1, 2\]"),
+        ("replay", {"sampler": "uniform", "middle": [1, 1]}, r"replay\.middle: unknown setting"),
     ):
         with pytest.raises(SettingsError, match=f"^{message}$"):
-            configs.from_dict(number | {"net": stored["net"] | {field: value}})
+            configs.from_dict(number | stored | {section: stored.get(section, {}) | values})
+    settings = configs.recorded(number | {"cem": {"start": "actor"}})
+    assert (settings["cem.start"], settings["cem.elites"]) == ("actor", 6)
 
 
 def _nested(depth: int) -> Any:
@@ -124,6 +136,7 @@ def _nested(depth: int) -> Any:
         ("net", {"dilations": [1] * 100_000}, r"net\.dilations: at most 64 items, not 100000"),
         ("learn", {"tau": _nested(100_000)}, "learn: is nested too deeply"),
         ("net", {"kind": ["small"]}, "net.kind: "),
+        ("heightmap", {"view": "both"}, r"^heightmap\.view: input should be 'ortho' or 'oblique'"),
     ],
 )
 def test_bad_values_are_one_line(section: str, values: Any, message: str):

@@ -8,9 +8,10 @@ import numpy as np
 from csac_jax import presets
 from csac_jax.config import CameraConfig, Config
 from csac_jax.render import gl
+from tests.sections import scaled
 
 CFG = Config().change(sim={"physics": "c", "robot": "ur5"}, scene=presets.smoke().scene)
-EYE = CameraConfig().scaled(0.5)
+EYE = scaled(CameraConfig(), 0.5)
 
 
 def scene() -> Any:

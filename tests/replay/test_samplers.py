@@ -193,21 +193,6 @@ def test_large_rings_are_drawn_evenly():
     assert_allclose(count / count.mean(), 1.0, atol=1e-3)
 
 
-def test_ranking_by_reward():
-    """Claim: by `rank_by` reward, rank 0 is the largest reward, signed, whatever the errors."""
-    sampler = samplers.make(BetaReplay(rank_by="reward", start=(1.0, 12.0)))
-    rewards = np.random.default_rng(0).normal(size=CAPACITY).astype(np.float32)
-
-    @dataclasses.dataclass
-    class Items:
-        reward: jax.Array
-
-    state = stored(sampler, np.random.default_rng(1).normal(size=CAPACITY), 400)
-    state = dataclasses.replace(state, items=Items(jnp.asarray(rewards)))
-    slots, _ = sampler.sample(jax.random.key(0), state, jnp.float32(0.0), NUM)
-    assert_fits(ranks(rewards[:400], np.asarray(slots)), beta_law(1.0, 12.0, 400))
-
-
 @dataclasses.dataclass
 class Action:
     primitive: jax.Array

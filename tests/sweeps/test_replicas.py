@@ -30,8 +30,6 @@ OTHER = {
     "learn.actor_learning_rate": 2e-3,
     "learn.lr_final_fraction": 0.5,
     "learn.tau": 0.3,
-    "replay.start": (2.0, 3.0),
-    "replay.middle": (3.0, 1.0),
     "replay.end": (4.0, 2.0),
 }
 """Another value of every traced hyper-parameter."""

@@ -6,6 +6,7 @@ import pytest
 
 from csac_jax.config import CameraConfig
 from csac_jax.vision import camera
+from tests.sections import scaled
 
 
 def test_the_default_is_the_papers_camera():
@@ -25,7 +26,7 @@ def test_the_default_is_the_papers_camera():
 def test_points_project_to_their_pixels(scale):
     """Claim: pixel -> point -> pixel is the identity, by the pinhole equation."""
     cfg = CameraConfig(focal=(600.0, 620.0), centre=(330.0, 236.0), position=(0.3, 0.4, 0.5))
-    eye = camera.make(cfg.scaled(scale))
+    eye = camera.make(scaled(cfg, scale))
     depth = np.random.default_rng(0).uniform(0.2, 2.0, (eye.height, eye.width)).astype(np.float32)
     points = np.asarray(camera.points(eye, jnp.asarray(depth)), np.float64)
     local = (points - np.asarray(eye.position)) @ np.asarray(eye.rotation, np.float64)

@@ -10,8 +10,9 @@ import pytest
 from csac_jax.config import CameraConfig, SensorConfig
 from csac_jax.vision import camera, depth_camera, observe, raycast, sensor
 from tests.deploy import scenes
+from tests.sections import scaled
 
-EYE = CameraConfig().scaled(0.5)
+EYE = scaled(CameraConfig(), 0.5)
 D415 = depth_camera.CAMERAS["d415"]
 WIDE = D415._replace(baseline=0.15)  # its shadows are wide enough to be compared
 SHAPES = scenes.blocks_at([[0.05, 0.06, 0.3], [-0.1, -0.05, 1.2]])

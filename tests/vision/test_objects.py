@@ -12,6 +12,7 @@ from csac_jax.vision import camera, observe
 from csac_jax.vision.heightmap import VIEW_HEIGHT
 from csac_jax.world import blocks, model, object_slots, scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.sections import scaled
 from tests.vision import mujoco_rays
 
 SHAPES = tuple(shape.kind for shape in blocks.SHAPES.values())
@@ -19,7 +20,7 @@ KINDS = ("object", "object", *dict.fromkeys(SHAPES))
 CONFIG = Config().change(
     scene={"slots": KINDS, "min_blocks": 1, "objects": "procedural:0:60", "split": "all"},
     sim={"physics": "c"},
-    camera=CameraConfig().scaled(0.25),
+    camera=scaled(CameraConfig(), 0.25),
 )
 
 

@@ -7,9 +7,10 @@ from hypothesis import given, settings, strategies as st
 
 from csac_jax.config import CameraConfig, HeightmapConfig
 from csac_jax.vision import camera, heightmap, observe, raycast
+from tests.sections import scaled
 
 CFG = HeightmapConfig(64, view="oblique")
-_EYE, _FINE = (camera.make(CameraConfig().scaled(share)) for share in (0.25, 0.5))
+_EYE, _FINE = (camera.make(scaled(CameraConfig(), share)) for share in (0.25, 0.5))
 
 
 def _by_hand(

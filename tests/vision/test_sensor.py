@@ -1,7 +1,6 @@
 """The sensor's errors follow their laws, and cost nothing when there are none."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from csac_jax.sim import outcome
 from csac_jax.vision import camera, heightmap, observe, sensor
 from csac_jax.world import scene_state
 from csac_jax.world.scene_state import SceneState
+from tests.sections import scaled
 
 ERRORS = SensorConfig(depth_noise=(0.001, 0.0014), dropped=0.1, colour=0.05)
 JITTER = dataclasses.replace(ERRORS, pose_noise=(0.005, 0.01))
@@ -96,7 +96,7 @@ class Still:
 
 
 def _env(**changes) -> Env:
-    cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=CameraConfig().scaled(0.1))
+    cfg = dataclasses.replace(presets.smoke(), heightmap=SMALL, camera=scaled(CameraConfig(), 0.1))
     return Env(dataclasses.replace(cfg, **changes), Still(), _scenes(cfg))
 
 
@@ -157,33 +157,6 @@ def test_colours_are_dropped_for_whole_episodes(view):
     np.testing.assert_array_equal(states.obs.colour[~grey[0]], true.colour[~grey[0]])
     every = jax.jit(_env(heightmap=view, sensor=SensorConfig(grey=1.0)).reset)(jax.random.key(0))
     assert (every.obs.colour == sensor.GREY).all()
-
-
-@pytest.mark.mjx
-def test_half_of_the_episodes_are_seen_from_the_side():
-    """Claim: by view `both` an episode has all its views from above or all from the side, half and
-    half, each as that view alone; without a key it is seen from above."""
-    env = _env(heightmap=dataclasses.replace(OBLIQUE, view="both"))
-    states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(6), 64))
-    later = jax.jit(jax.vmap(env.step, (0, None)))(states, _PUSH)
-    alone = {
-        name: jax.jit(jax.vmap(functools.partial(observe.observe, _env(heightmap=view).cfg)))
-        for name, view in (("aside", OBLIQUE), ("above", SMALL))
-    }
-    drawn = []
-    for state in (states, later):
-        alike = {
-            name: np.isclose(look(state.scene).height, state.obs.height, atol=1e-6).all((1, 2))
-            for name, look in alone.items()
-        }
-        np.testing.assert_array_equal(alike["above"], ~alike["aside"])
-        drawn.append(alike["aside"])
-    np.testing.assert_array_equal(*drawn)
-    assert 0.3 < drawn[0].mean() < 0.7
-    scene = jax.tree.map(lambda leaf: leaf[0], states.scene)
-    np.testing.assert_allclose(
-        _look(env, scene).height, alone["above"](states.scene).height[0], atol=1e-6
-    )
 
 
 @pytest.mark.mjx
