@@ -9,6 +9,7 @@ SIGTERM comes as 50 requests wait.
 import concurrent.futures
 import http.client
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -116,10 +117,10 @@ def _bother(end: float, port: int) -> None:
 
 
 def load(
-    port: int, content: bytes, clients: int, seconds: float, hostile: bool = False
+    port: int, content: bytes, clients: int, seconds: float, process: int, hostile: bool = False
 ) -> dict[str, Any]:
     """Measures `clients` that ask at once, and /health as they do; maybe with a hostile one."""
-    begun, health = time.perf_counter(), []
+    begun, health, worked = time.perf_counter(), [], _cpu_seconds(process)
     with concurrent.futures.ThreadPoolExecutor(clients + 1) as pool:
         end = begun + seconds
         bothering = pool.submit(_bother, end if hostile else begun, port)
@@ -136,6 +137,7 @@ def load(
         "answered": len(answered),
         "refused": len(refused),
         "per_second": len(answered) / (time.perf_counter() - begun),
+        "cpu_s_each": (_cpu_seconds(process) - worked) / max(len(answered), 1),
         **_milliseconds("answer", [reply.seconds for reply in answered]),
         **_milliseconds("decision", [reply.own for reply in answered]),
         **_milliseconds("refusal", refused),
@@ -156,6 +158,13 @@ def _stop(port: int, content: bytes, process: subprocess.Popen[bytes]) -> dict[s
     return {"answered": replies.count(200), "refused": replies.count(429), "seconds": seconds}
 
 
+def _cpu_seconds(process: int) -> float:
+    """Returns what a process has had of all cores; NaN where Linux does not tell it."""
+    status = Path(f"/proc/{process}/stat")
+    ticks = status.read_text().rpartition(")")[2].split()[11:13] if status.exists() else ["nan"]
+    return sum(map(float, ticks)) / os.sysconf("SC_CLK_TCK")
+
+
 def _peak_mib(process: subprocess.Popen[bytes]) -> float | None:
     """Returns the process's largest memory, where Linux tells it."""
     status = Path(f"/proc/{process.pid}/status")
@@ -173,8 +182,8 @@ def measure(seconds: int, port: int) -> dict[str, Any]:
         _until_ready(port, process, errors)
         started = time.perf_counter() - begun
         first = ask(port, content).seconds
-        loads = [load(port, content, clients, seconds) for clients in CLIENTS]
-        hostile = load(port, content, BOTHERED, seconds, hostile=True)
+        loads = [load(port, content, clients, seconds, process.pid) for clients in CLIENTS]
+        hostile = load(port, content, BOTHERED, seconds, process.pid, hostile=True)
         memory = _peak_mib(process)
         stop = _stop(port, content, process)
     finally:
