@@ -15,7 +15,7 @@ from csac_jax.deploy.requests import MOST_PIXELS, Question
 from csac_jax.section import require
 from csac_jax.vision.heightmap import Observation
 
-THREADS = min(4, os.cpu_count() or 1)  # that decide; while one waits for the device, others decode
+THREADS = min(4, 1 + (os.cpu_count() or 1) // 4)  # that decide; one decision keeps two cores busy
 MOST_SIZES = 8  # of images, px: each is compiled for
 
 
