@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 MOST_WAITING = 64  # items
-LONGEST = 0.5  # s, expected until the answer to an item that finds others waiting; it may take twice
+LONGEST = 0.5  # s, expected until the answer to an item that finds others waiting; at times twice
 _FORGETTING = 0.2  # share of the newest batch in the pace
 
 
