@@ -232,7 +232,7 @@ def test_oracle_beats_random_in_physics():
 
 ANY: Any = {"sim": {"physics": "auto"}}
 ONE = presets.quick().change(scene={"packed_fraction": 0.0}, **ANY)
-BOTH = presets.general().change(heightmap={"view": "both"}, sensor=SensorConfig(), **ANY)
+BOTH = presets.general().change(sensor=SensorConfig(), **ANY)
 
 
 @pytest.mark.parametrize(
@@ -244,7 +244,6 @@ BOTH = presets.general().change(heightmap={"view": "both"}, sensor=SensorConfig(
         (ONE, {"scene": {"slots": ("object",) * 5, "objects": "x"}}, "with blocks, not objects of"),
         (ONE, {"train": {"scenes": 1}, "sim": {"physics": "c"}}, None),
         *((BOTH, {"task": {"kind": kind}}, None) for kind in ("clear", "target")),
-        *((BOTH, {"heightmap": {"view": view}}, None) for view in ("ortho", "oblique")),
         *((BOTH, {"scene": {"slots": (s,), "min_blocks": 1}}, None) for s in ("box", "object")),
     ],
 )

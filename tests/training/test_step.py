@@ -165,15 +165,17 @@ def test_overlap_learns_from_what_was_before(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_chunk_does_not_speak_to_the_host():
-    """Claim: no callback, no feed and no transfer in a chunk with MJX, at any depth."""
+    """Claim: no callback, no feed and no transfer in a chunk with MJX, at any depth. It runs."""
     program = programs.make(CFG.change(sim={"physics": "mjx"}))
-    begun = jax.eval_shape(lambda: programs.init(program))
-    traced = programs.compile_chunk(program, T).trace(begun)
+    traced = programs.compile_chunk(program, T).trace(begun := programs.init(program))
     loud = jax.make_jaxpr(jax.vmap(jax.jit(lambda x: jax.debug.print("{x}", x=x))))(jnp.ones(2))
     quiet, spoken = (str(jaxpr) for jaxpr in (traced.jaxpr, loud))  # nested programs too
     assert all(f" {name}[" in quiet for name in ("scan", "while", "conv_general_dilated", "sort"))
     assert not any(word in quiet for word in HOST)
     assert any(word in spoken for word in HOST)
+    after, metrics = traced.lower().compile()(begun)
+    assert int(after.replay.size) == NUM_SEEN
+    assert not np.any(metrics.physics_diverged)
 
 
 def test_replay_is_updated_in_place(run):
