@@ -33,6 +33,7 @@ FIXED = {
 """Former settings of each section, which must have the value of today's constant."""
 
 VALUES: dict[str, dict[str, str]] = {
+    "heightmap.view": {"both": "ortho"},  # half of the episodes were seen from the side
     "policy.action_mask": {"all": "none"},
     "reward.outcome_source": {"truth": "simulator", "sensed": "sensors"},
     "reward.push_label": {"value": "stored", "renewed": "current_critic", "change": "map_changed"},
