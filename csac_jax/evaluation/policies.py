@@ -249,7 +249,7 @@ def load_config(source: str | Path, which: Which = "last") -> Config:
     """Reads the config of a policy; see `load`."""
     if (path := policy_file.find(source)).is_file():
         return policy_file.load(path)[0]
-    return checkpoint.load_config(*_checkpoint(path, which))
+    return checkpoint.load_config(*_checkpoint(path, which), acts=True)
 
 
 def load(
@@ -264,7 +264,7 @@ def load(
     if (path := policy_file.find(source)).is_file():
         return NetworkPolicy(*policy_file.load(path))
     folder, step = _checkpoint(path, which)
-    cfg = checkpoint.load_config(folder, step)
+    cfg = checkpoint.load_config(folder, step, acts=True)
     own_parts.check_loadable(folder, cfg, own_parts.OwnParts(network=network, learner=learner))
     shapes = programs.abstract_state(cfg, learner, network)
     needed, room = memory.tree_bytes(shapes) / memory.GIB, memory.limit() / memory.GIB

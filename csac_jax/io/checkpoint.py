@@ -119,11 +119,11 @@ def _check_complete(draft: Path, arrays: dict[str, Any]) -> None:
             raise OSError(f"{name} was not written whole")
 
 
-def load_config(run_dir: Path, step: int | None = None) -> Config:
-    """Reads the config of a checkpoint; see `restore`."""
+def load_config(run_dir: Path, step: int | None = None, acts: bool = False) -> Config:
+    """Reads the config of a checkpoint; see `restore`, and `configs.from_dict` of `acts`."""
     folder = sound(run_dir, step)
     try:
-        return configs.from_dict(_read(folder, config=ocp.args.JsonRestore())["config"])
+        return configs.from_dict(_read(folder, config=ocp.args.JsonRestore())["config"], acts)
     except ValueError as error:
         raise CheckpointError(
             f"checkpoint {folder} was made by another version of csac_jax ({error}); "

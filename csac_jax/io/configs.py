@@ -53,14 +53,20 @@ def _plain(value: Section | Gripper) -> dict[str, Any]:
     return vars(value)
 
 
-def from_dict(values: Any) -> Config:
-    """Reads what `to_dict` returned, of older versions too. Raises SettingsError in one line."""
+def from_dict(values: Any, acts: bool = False) -> Config:
+    """Reads what `to_dict` returned, of older versions too. Raises SettingsError in one line.
+
+    `acts`: the config is of a policy that only acts. Former settings of the replay are left out.
+    """
     if not isinstance(values, dict):
         raise SettingsError(f"config: must be an object, not {shown(values)}")
     if (number := values.get("format")) != FORMAT:
         text = f"{shown(number)} is unknown, this version reads {FORMAT}"
         raise SettingsError(f"format: {text}; use the csac-jax that wrote it")
     stored = renames.current(values)
+    if acts and isinstance(replay := stored.get("replay"), dict):
+        former = renames.FIXED["replay"]
+        stored["replay"] = {name: replay[name] for name in replay if name not in former}
     return Config(**{name: _validated(name, stored[name]) for name in stored if name != "format"})
 
 

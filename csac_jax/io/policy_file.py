@@ -134,7 +134,7 @@ def _content(path: Path) -> tuple[dict[str, str], dict[str, np.ndarray]]:
 
 def _config(path: Path, remarks: dict[str, str]) -> tuple[Config, Any]:
     try:
-        cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG))
+        cfg = configs.from_dict(files.parse(remarks[_CONFIG], _CONFIG), acts=True)
         if _GRIPPER in remarks:
             numbers = files.parse(remarks[_GRIPPER], _GRIPPER)
             gripper = grippers.from_numbers(Path(str(cfg.sim.gripper)), numbers)

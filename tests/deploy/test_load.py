@@ -141,6 +141,7 @@ def test_waiting_requests_are_decided_together(
     """Claim: where batches pay, those that wait are decided together, in numbers that are compiled
     for. Each gets an answer, and masked images have their own batches."""
     monkeypatch.setattr(decider, "batches", lambda: (1, 4, 16))
+    monkeypatch.setattr(batching, "LONGEST", 60.0)
     running = start(0.3)
     bodies = [{**BODY, "top": 1 + n % 8} for n in range(40)]
     bodies += [{**BODY, "mask": BODY["depth"], "top": 9}] * 4
