@@ -51,6 +51,7 @@ from experiments.samplers import ReaPER, TruncatedGeometric
 MAIN, CONTROL, SEARCH = 1000, 1400, 1300  # first seeds
 EPISODES = 100  # of every part of a suite
 RESERVED = 2  # cores that evaluations leave to training
+TOGETHER = 4  # seeds that a process evaluates, with one compiled program
 OF_TARGETS, OF_CLEARING = ("enclosed", "target"), ("blocked", "tray", "random10")
 ABOUT = {
     "pushes": "the same learner with and without pushes, 327,680 actions",
@@ -287,24 +288,33 @@ def _evaluated(
 
 
 def evaluate(chosen: Sequence[Arm], folder: Path, jobs: int) -> None:
-    """Evaluates the trained policies that are left, in C MuJoCo, `jobs` at a time."""
+    """Evaluates the trained policies that are left, in C MuJoCo, by `jobs` processes."""
     tasks = [
-        (arm, folder, seed, suite)
+        (arm, folder, seeds, suite)
         for arm in chosen
         if is_trained(arm, folder)
-        for seed, suite in left(arm, folder)
+        for suite in arm.suites
+        if (open_seeds := {seed for seed, of in left(arm, folder) if of == suite})
+        for seeds in _together(*arm.seeds)
+        if open_seeds.intersection(seeds)
     ]
     on_done = lambda number, _: print(f"evaluated {tasks[number][0].place}", flush=True)  # noqa: E731
-    processes.each(evaluate_run, tasks, jobs, lambda *_: None, on_done)
+    processes.each(evaluate_runs, tasks, jobs, lambda *_: None, on_done)
 
 
-def evaluate_run(_: Any, arm: Arm, folder: Path, seed: int, suite: str) -> None:
-    """Evaluates the policies of one seed in a suite."""
+def _together(first: int, number: int) -> Iterator[range]:
+    """Yields the seeds in ranges of `TOGETHER`."""
+    for start in range(first, first + number, TOGETHER):
+        yield range(start, min(start + TOGETHER, first + number))
+
+
+def evaluate_runs(_: Any, arm: Arm, folder: Path, seeds: range, suite: str) -> None:
+    """Evaluates the policies of some seeds in a suite."""
     plan = runner.read_plan(folder / arm.place)
-    points = [point._replace(cfg=point.cfg.change(seed=seed)) for point in plan.points]
-    one = SweepPlan(1, points, arm.episodes)
+    points = [point._replace(cfg=point.cfg.change(seed=seeds.start)) for point in plan.points]
+    some = SweepPlan(len(seeds), points, arm.episodes)
     with Terminal(Console(quiet=True)) as terminal:
-        final.measure(one, folder / arm.place, terminal, signals.Stop(), suite, _own(arm))
+        final.measure(some, folder / arm.place, terminal, signals.Stop(), suite, _own(arm))
 
 
 def states(chosen: Sequence[Arm], folder: Path) -> Iterator[dict[str, str]]:
