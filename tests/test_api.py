@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,10 @@ from csac_jax.sweeps.runner import SweepResult
 from csac_jax.training import own_parts, programs, step
 from csac_jax.training.callbacks import Record, Summary
 from csac_jax.vision.heightmap import Observation
-from examples.own_learner import QLearner
-from examples.own_network import PlainNet
 from tests.networks import learner_state, random_params
 
+PlainNet = importlib.import_module("examples.04_own_network").PlainNet
+QLearner = importlib.import_module("examples.05_own_learner").QLearner
 SMOKE = presets.smoke().change(sim={"physics": "c"})  # compiles in half of the time
 
 SUMMARY = Summary(4, 8, 1.5, 0.5, None, 0, None)

@@ -126,7 +126,7 @@ def parses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise Parsed
 
     monkeypatch.setattr(parsing, "parse", stop)
-    monkeypatch.setattr(checkpoint, "load_config", lambda folder, at=None: presets.quick())
+    monkeypatch.setattr(checkpoint, "load_config", lambda *_, **__: presets.quick())
 
 
 def _check(words: list[str], extras: set[str], targets: set[str]) -> None:
@@ -246,7 +246,7 @@ def test_robot_page_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     page = ROBOT.read_text().replace("\\\n", " ")
     lines = re.findall(r"^ *((?:python|csac-jax) .*)$", page, re.MULTILINE)
-    images = [line for line in lines if "camera_image.py" in line and "--board" not in line]
+    images = [line for line in lines if "08_camera_image.py" in line and "--board" not in line]
     for line in images + [line for line in lines if "--record record" in line]:
         _run_command(line)
     (tmp_path / "record/000001/outcome.json").write_text('{"outcome": "lifted"}')

@@ -10,16 +10,16 @@ import csac_jax
 from csac_jax import presets
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
-NOTEBOOK = FOLDER / "first_grasp.ipynb"
-TRAINERS = {"own_sampler", "own_network", "own_learner"}
-OTHERS = {"random_agent", "gym_policy_gradient", "optuna_search"}
-LONG = {
-    "ros2_node",
-    "ur_rtde",
-    "franka",
-    "realsense",
-    "camera_image",
-}  # see test_robot_examples and test_docs
+NOTEBOOK = FOLDER / "01_first_grasp.ipynb"
+TRAINERS = {"03_own_sampler", "04_own_network", "05_own_learner"}
+OTHERS = {"02_random_agent", "06_gym_policy_gradient", "07_optuna_search"}
+LONG = {  # see test_robot_examples and test_docs
+    "08_camera_image",
+    "09_realsense",
+    "10_franka",
+    "11_ur_rtde",
+    "12_ros2_node",
+}
 pytestmark = [pytest.mark.mjx, pytest.mark.optax]
 
 
@@ -28,9 +28,14 @@ def _module(name: str) -> ModuleType:
 
 
 def test_examples_are_short_and_tested():
-    """Claim: an example has at most 60 lines, one for a robot or its camera 100; all are tested."""
+    """Claim: an example has at most 60 lines, one for a robot or its camera 100; all are tested.
+    They are numbered, and each is named on a page."""
     paths = {path.stem: path for path in FOLDER.glob("*.py")}
     assert paths.keys() == TRAINERS | OTHERS | LONG
+    pages = "".join(page.read_text() for page in (FOLDER.parent / "docs").rglob("*.md"))
+    names = sorted(path.name for path in FOLDER.iterdir() if path.is_file())
+    assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
+    assert [name for name in names if f"examples/{name}" not in pages] == []
     for name, path in paths.items():
         assert len(path.read_text().splitlines()) <= (100 if name in LONG else 60), name
 
@@ -55,7 +60,7 @@ def test_own_parts_train(small: str, name: str, tmp_path: Path):
 
 def test_random_agent_runs(small: str):
     """Claim: the environment runs in a scan of a vmap, with finished scenes replaced."""
-    assert 0.0 <= _module("random_agent").main(small, "6") <= 1.0
+    assert 0.0 <= _module("02_random_agent").main(small, "6") <= 1.0
 
 
 @pytest.mark.slow
@@ -69,7 +74,7 @@ def test_policy_gradient_learns(monkeypatch: pytest.MonkeyPatch):
         task={"max_actions": 1},
     )
     monkeypatch.setitem(presets.PRESETS, "easy", lambda: cfg)
-    returns = _module("gym_policy_gradient").main("easy", "150", "16")
+    returns = _module("06_gym_policy_gradient").main("easy", "150", "16")
     assert sum(returns[-50:]) > 1.3 * sum(returns[:50])
 
 
@@ -77,7 +82,7 @@ def test_policy_gradient_learns(monkeypatch: pytest.MonkeyPatch):
 def test_search_tries_settings(small: str, tmp_path: Path):
     """Claim: the search trains each trial into its own folder, keeps its results, and continues."""
     pytest.importorskip("optuna")
-    search = _module("optuna_search").main
+    search = _module("07_optuna_search").main
     assert len(search(small, tmp_path / "search", "1", "2").trials) == 1
     study = search(small, tmp_path / "search", "1", "2")
     assert [trial.state.name for trial in study.trials] == ["COMPLETE"] * 2

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 import csac_jax
 
 FOLDER = Path(csac_jax.__file__).parents[1] / "examples"
-UR = runpy.run_path(str(FOLDER / "ur_rtde.py"))
-FRANKA = runpy.run_path(str(FOLDER / "franka.py"))
-REALSENSE = runpy.run_path(str(FOLDER / "realsense.py"))
-ROS = runpy.run_path(str(FOLDER / "ros2_node.py"))
+UR = runpy.run_path(str(FOLDER / "11_ur_rtde.py"))
+FRANKA = runpy.run_path(str(FOLDER / "10_franka.py"))
+REALSENSE = runpy.run_path(str(FOLDER / "09_realsense.py"))
+ROS = runpy.run_path(str(FOLDER / "12_ros2_node.py"))
 ARGS = SimpleNamespace(speed=0.05, acceleration=0.2, force=15.0, reach=0.85, lowest=0.0)
 HEIGHTS = {"approach": 0.2, "descend": 0.1, "act": 0.1, "retreat": 0.2}
 

@@ -20,6 +20,7 @@ from csac_jax.config import Config, HeightmapConfig, PolicyConfig, SimConfig
 from csac_jax.constants import Primitive
 from csac_jax.grippers import Fingers
 from csac_jax.nets import dense
+from csac_jax.nets.convolution import conv2d
 from csac_jax.nets.networks import Networks
 from csac_jax.robot import fit, primitives
 from csac_jax.sim.outcome import BARE
@@ -166,7 +167,18 @@ def rotated_inputs(frames: Frames, obs: Observation, k: Any = slice(None)) -> ja
     heights = rotate.rotate(frames.tables, obs.height[..., None], k)[..., 0]
     least = primitives.grasp_depth(frames.sim, gripper), primitives.lowest(frames.sim, gripper)
     found = fit.everywhere(frames.tables.cell, heights, *least, gripper, fingers)
-    return jnp.concatenate([rotated, FIT_SCALE * found], axis=-1)
+    return jnp.concatenate([rotated, FIT_SCALE * _computed_once(found)], axis=-1)
+
+
+def _computed_once(maps: jax.Array) -> jax.Array:
+    """Returns maps [F, C, C, ch] through a product by 1, which XLA computes apart from the rest.
+
+    On a CPU it would else compute them again for each channel of what they are joined to.
+    """
+    if jax.default_backend() != "cpu":
+        return maps
+    one = jnp.eye(maps.shape[-1], dtype=maps.dtype)[None, None]
+    return conv2d(maps, one, stride=1, dilation=1, padding=0)
 
 
 def unfold(halves: jax.Array) -> jax.Array:
@@ -192,10 +204,15 @@ def actionable_cells(frames: Frames, obs: Observation) -> jax.Array:
         return jnp.asarray(allowed)
     under, graspable = (cell_heights(frames, top) > BARE for top in surfaces(frames, obs))
     reach = int(np.ceil(frames.push_length / frames.cell))
-    ahead = jax.lax.reduce_window(
-        under, False, jnp.logical_or, (1, 3, reach + 1), (1, 1, 1), ((0, 0), (1, 1), (0, reach))
-    )
+    beside = _any_of(under, (1, 3, 1), (0, 1, 0))
+    ahead = _any_of(beside, (1, 1, reach + 1), (0, 0, reach))
     return jnp.stack([ahead, graspable]) & allowed
+
+
+def _any_of(maps: jax.Array, window: tuple[int, ...], after: tuple[int, ...]) -> jax.Array:
+    """Tells of each cell whether any in its window holds, which ends `after` cells on."""
+    padding = [(size - 1 - end, end) for size, end in zip(window, after, strict=True)]
+    return jax.lax.reduce_window(maps, False, jnp.logical_or, window, (1, 1, 1), padding)
 
 
 def surfaces(frames: Frames, obs: Observation) -> tuple[jax.Array, jax.Array]:

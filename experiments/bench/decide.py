@@ -1,13 +1,14 @@
 """Times decisions of the policies that ship, as JSON: `csac-jax bench decide [--repeats N]`.
 
-The image is that of examples/camera_image.py, 640 x 480 px. Each policy decides by one look, and by
-the mean over four mirror images (`policy.augment`), in turn, REPEATS (30) times: given the image,
-or the view from above that follows from it. The least time is that of a machine on which nothing
-else runs; the median has what else ran.
+The image is that of examples/08_camera_image.py, 640 x 480 px. Each policy decides by one look, and
+by the mean over four mirror images (`policy.augment`), in turn, REPEATS (30) times: given the
+image, or the view from above that follows from it. The least time is that of a machine on which
+nothing else runs; the median has what else ran.
 """
 
 import dataclasses
 import functools
+import importlib
 import statistics
 import tempfile
 from pathlib import Path
@@ -18,10 +19,10 @@ import jax
 from csac_jax.deploy import CameraPolicy, image_files
 from csac_jax.io import policy_file
 from csac_jax.runtime import processes
-from examples import camera_image
 from experiments.bench._options import timed
 from experiments.bench._timing import seconds
 
+camera_image = importlib.import_module("examples.08_camera_image")
 LOOKS = {"one look": False, "four looks": True}
 
 

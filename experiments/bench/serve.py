@@ -8,6 +8,7 @@ SIGTERM comes as 50 requests wait.
 
 import concurrent.futures
 import http.client
+import importlib
 import json
 import os
 import signal
@@ -22,9 +23,9 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from csac_jax.errors import FailedError
-from examples import camera_image
 from experiments.bench._options import timed
 
+camera_image = importlib.import_module("examples.08_camera_image")
 PATIENCE = 300.0  # s, until it has compiled
 CLIENTS = (1, 10, 50, 200)
 BOTHERED = 10  # clients beside a hostile one
@@ -41,7 +42,7 @@ class Reply(NamedTuple):
 
 
 def body() -> bytes:
-    """Builds a request with the images of examples/camera_image.py, 640 x 480 px."""
+    """Builds a request with the images of examples/08_camera_image.py, 640 x 480 px."""
     with tempfile.TemporaryDirectory() as folder:
         camera_image.main(folder)
         return (Path(folder) / "request.json").read_bytes()

@@ -3,6 +3,7 @@
 import base64
 import concurrent.futures
 import contextlib
+import importlib
 import json
 import shlex
 import shutil
@@ -22,12 +23,12 @@ from csac_jax import cli
 from csac_jax.cli.robot_options import RobotOptions
 from csac_jax.deploy import decider, requests
 from csac_jax.deploy.image_files import encode
-from examples import camera_image
 from tests.deploy import scenes
 
 pytest.importorskip("uvicorn")
 pytest.importorskip("fastapi")
 
+camera_image = importlib.import_module("examples.08_camera_image")
 TOKEN = "correct horse battery"
 SIDE = 2048  # px, as large as an image may be
 MEMORY = 2.0 + 0.4 * (decider.THREADS - 2)  # GiB

@@ -220,21 +220,21 @@ def test_old_file_without_digest_loads_with_a_warning(tmp_path: Path, params: Pa
         assert policy_file.load(path)[0] == CFG
 
 
+@pytest.mark.filterwarnings("ignore")
 def test_a_policy_acts_whatever_its_replay_was(tmp_path: Path, params: Params):
     """Claim: a policy whose training had another value of a former setting of the replay loads; one
     of the search for actions is refused."""
-    path = tmp_path / "policy.safetensors"
-    for section, values in (("replay", {"rank_by": "reward"}), ("cem", {"start": "actor"})):
-        stored = STORED | {section: STORED[section] | values}
+
+    def with_former(section: str, values: dict[str, Any]) -> Path:
+        path, stored = tmp_path / f"{section}.safetensors", STORED[section] | values
         policy_file.save(path, params, CFG)
-        _rewrite(path, lambda _, remarks, text=json.dumps(stored): remarks.update(config=text))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if section == "replay":
-                assert policy_file.load(path)[0] == CFG
-                continue
-            with pytest.raises(PolicyFileError, match="cem.start: must be 'both'"):
-                policy_file.load(path)
+        text = json.dumps(STORED | {section: stored})
+        _rewrite(path, lambda _, remarks: remarks.update(config=text))
+        return path
+
+    assert policy_file.load(with_former("replay", {"rank_by": "reward"}))[0] == CFG
+    with pytest.raises(PolicyFileError, match=r"cem\.start: must be 'both'"):
+        policy_file.load(with_former("cem", {"start": "actor"}))
 
 
 def test_other_versions_are_named(tmp_path: Path, params: Params, monkeypatch: pytest.MonkeyPatch):

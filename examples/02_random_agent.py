@@ -1,6 +1,6 @@
 """The environment by itself: random grasps in a batch of scenes, with automatic reset.
 
-python examples/random_agent.py [PRESET] [STEPS]
+python examples/02_random_agent.py [PRESET] [STEPS]
 """
 
 import sys

@@ -1,7 +1,7 @@
 """Moves a Universal Robots arm and its gripper through the waypoints of a decision.
 
-    python examples/ur_rtde.py decision.json                         # prints the set-points
-    python examples/ur_rtde.py decision.json --host 192.168.1.10     # needs: pip install ur-rtde
+    python examples/11_ur_rtde.py decision.json                         # prints the set-points
+    python examples/11_ur_rtde.py decision.json --host 192.168.1.10     # needs: pip install ur-rtde
 
 `decision.json` is what `csac-jax act ... --workspace workspace.json --json decision.json` writes.
 The controller's tool centre point must lie between the finger tips, its z along the fingers. Put

@@ -1,6 +1,6 @@
 """Search of settings with Optuna; needs `pip install optuna`.
 
-python examples/optuna_search.py [PRESET] [FOLDER] [TRIALS] [EPISODES]
+python examples/07_optuna_search.py [PRESET] [FOLDER] [TRIALS] [EPISODES]
 
 Each trial is a run of its own: FOLDER/trial-N. Bad trials end early, by the success in training.
 The study lies in FOLDER/study.db: the same command goes on with it.

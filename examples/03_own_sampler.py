@@ -1,6 +1,6 @@
 """A sampler of your own: ranks of the TD error follow an exponential law.
 
-python examples/own_sampler.py [PRESET] [RUN_DIR]
+python examples/03_own_sampler.py [PRESET] [RUN_DIR]
 """
 
 import dataclasses

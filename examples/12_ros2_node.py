@@ -1,7 +1,7 @@
 """A ROS 2 node that decides: camera topics in, poses of the waypoints out.
 
     ros2 run tf2_ros static_transform_publisher ... workspace camera_color_optical_frame
-    python examples/ros2_node.py --ros-args -p policy:=shipped
+    python examples/12_ros2_node.py --ros-args -p policy:=shipped
 
 Topics: /camera/color/image_raw, /camera/aligned_depth_to_color/image_raw, and their camera_info.
 Service ~/decide (std_srvs/Trigger) publishes a PoseArray on ~/waypoints, in the workspace's frame,

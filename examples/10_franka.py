@@ -1,7 +1,7 @@
 """Moves a Franka arm and its hand through the waypoints of a decision.
 
-    python examples/franka.py decision.json                      # prints the set-points
-    python examples/franka.py decision.json --host 172.16.0.2    # needs: pip install franky-control
+    python examples/10_franka.py decision.json                    # prints the set-points
+    python examples/10_franka.py decision.json --host 172.16.0.2  # pip install franky-control
 
 `csac-jax act ... --gripper franka_hand --workspace workspace.json --json decision.json` writes the
 decision. The arm's end effector must be the hand's own, as the Desk sets it. It was tested with a

@@ -1,6 +1,6 @@
 """A learner of your own: Q-learning on a dense map of grasps.
 
-python examples/own_learner.py [PRESET] [RUN_DIR]"""
+python examples/05_own_learner.py [PRESET] [RUN_DIR]"""
 
 import sys
 

@@ -1,6 +1,6 @@
 """Takes one image with an Intel RealSense, as files that `csac-jax act` reads.
 
-    python examples/realsense.py shot    # rgb.png, depth.npy, intrinsics.json in the folder `shot`
+    python examples/09_realsense.py shot    # rgb.png, depth.npy, intrinsics.json in `shot`
 
 Needs: pip install pyrealsense2. It was tested with a fake camera, never with a real one.
 """

@@ -1,6 +1,6 @@
 """A learner in one file, on the Gymnasium environment: policy gradient of a Gaussian.
 
-python examples/gym_policy_gradient.py [PRESET] [STEPS] [SCENES]
+python examples/06_gym_policy_gradient.py [PRESET] [STEPS] [SCENES]
 
 It learns where to grasp from the height map; each action is paid for by itself.
 """

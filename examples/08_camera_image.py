@@ -1,9 +1,9 @@
 """An image as a depth camera gives it, drawn by our own rays: to try `csac-jax act` without one.
 
-python examples/camera_image.py demo          # rgb.png, depth.png, intrinsics.json, pose.json
+python examples/08_camera_image.py demo          # rgb.png, depth.png, intrinsics.json, pose.json
                                               # and request.json, all of them for `csac-jax serve`
-python examples/camera_image.py empty --empty # the same camera over the empty table
-python examples/camera_image.py board --board board.png  # the table with a printed page on it
+python examples/08_camera_image.py empty --empty # the same camera over the empty table
+python examples/08_camera_image.py board --board board.png  # the table with a printed page on it
 """
 
 import base64

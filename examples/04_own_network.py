@@ -1,6 +1,6 @@
 """A network of your own: three plain convolutions in place of the dense net.
 
-python examples/own_network.py [PRESET] [RUN_DIR]
+python examples/04_own_network.py [PRESET] [RUN_DIR]
 """
 
 import sys
