@@ -13,7 +13,7 @@ EPISODE = "--scene blocked --seed 7 --robot ur5e --policy shipped+planner"
 @dataclasses.dataclass(frozen=True)
 class DemoOptions:
     """Writes a video of an arm that pushes blocks apart and takes them: networks propose actions,
-    and physics chooses. It takes about a minute and a half on two cores."""
+    and physics chooses. It takes about a minute on two cores."""
 
     out: Path = Path("demo.webp")
     """File to write: .webp or .gif; .mp4, .mkv or .mov with the extra `video`."""

@@ -90,7 +90,7 @@ def _light(model: mujoco.MjModel) -> None:
     model.light_diffuse[:], model.light_specular[:] = 0.45, 0.1
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.5, 0.2
     model.vis.map.shadowscale = 0.3  # of the lamp's cone; all of the arm lies in it
-    model.vis.quality.shadowsize, model.vis.quality.offsamples = 4096, 8
+    model.vis.quality.shadowsize, model.vis.quality.offsamples = 2048, 8
 
 
 def _ray_renderer(model: mujoco.MjModel, view: Viewpoint) -> Draw:
