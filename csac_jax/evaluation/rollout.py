@@ -168,7 +168,7 @@ class StepRecord(NamedTuple):
 def episode(env: Env, policy: Policy, seed: int) -> Iterator[StepRecord]:
     """Runs one episode in the first scene of the environment's pool, and yields every action."""
     key, first = jax.random.key(seed), jax.tree.map(lambda leaf: leaf[:1], env.scenes)
-    jit = functools.partial(jax.jit, compiler_options=compiler.options(env.cfg))
+    jit = functools.partial(jax.jit, compiler_options=compiler.options(env.cfg, brief=True))
     begin, step = (jit(functools.partial(part, env)) for part in (_begin, _recorded_step))
     states = begin(jax.random.fold_in(key, 0), jnp.zeros(1, jnp.int32), first)
     state = jax.tree.map(lambda leaf: leaf[0], states)

@@ -23,6 +23,7 @@ from csac_jax.config import Config, SmallNet
 
 LIBRARY = {_guard.FUSION_FLAG.lstrip("-"): "LIBRARY_FUSION_TYPE_INDIVIDUAL_CONVOLUTION"}
 SOONER = {"xla_backend_optimization_level": 2, "xla_cpu_use_fusion_emitters": False}
+SOONEST = SOONER | {"xla_backend_optimization_level": 0}  # the program is slower by half
 VENDOR = {"xla_gpu_enable_triton_gemm": False}
 _BOUND = 1e-4  # largest error of a sum of 360 products of numbers near 1; float32 gives some 1e-5
 
@@ -38,13 +39,16 @@ def lower(jitted: Any, *inputs: Any) -> Any:
             gc.enable()
 
 
-def options(cfg: Config) -> dict[str, Any] | None:
+def options(cfg: Config, brief: bool = False) -> dict[str, Any] | None:
     """Returns the options of `jax.jit` for the config's training program; None for the defaults.
-    The second library is slow at kernel gradients, which `nets.convolution` keeps from it."""
+
+    The second library is slow at kernel gradients, which `nets.convolution` keeps from it. Args:
+    brief, the program takes less time than to compile it.
+    """
     small, backend = isinstance(cfg.net, SmallNet), jax.default_backend()
     if backend == "cpu":
-        flags = os.environ.get("XLA_FLAGS", "")
-        sooner = {k: v for k, v in SOONER.items() if f"--{k}=" not in flags and knows(k, v)}
+        flags, wanted = os.environ.get("XLA_FLAGS", ""), SOONEST if brief else SOONER
+        sooner = {k: v for k, v in wanted.items() if f"--{k}=" not in flags and knows(k, v)}
         return sooner | (LIBRARY if small and has_library() else {})
     vendor = backend == "gpu" and not small and all(map(knows, VENDOR, VENDOR.values()))
     return dict(VENDOR) if vendor else None

@@ -73,8 +73,10 @@ def test_library_that_is_lacking_or_wrong_is_not_used(monkeypatch: pytest.Monkey
 @pytest.mark.usefixtures("forgotten")
 def test_library_is_for_the_small_net_on_a_cpu(monkeypatch: pytest.MonkeyPatch):
     """Claim: it is asked for with the small net, not with DenseNet-121, and on no accelerator; so
-    is what compiles sooner, with any net."""
+    is what compiles sooner, with any net, and soonest where the program is brief."""
     assert compiler.options(presets.quick()) == compiler.LIBRARY | compiler.SOONER
+    brief = compiler.options(presets.paper(), brief=True)
+    assert brief == {**compiler.SOONER, "xla_backend_optimization_level": 0}
     assert compiler.options(presets.paper()) == compiler.SOONER
     with monkeypatch.context() as patch:  # a jaxlib that lacks one of the options
         patch.setattr(compiler, "SOONER", {**compiler.SOONER, "xla_no_such_option": 1})
