@@ -141,6 +141,20 @@ def test_pushes_are_valid_ahead_of_which_a_block_lies(cfg, frames, block):
     assert counts.min() > 10
 
 
+def test_pushes_look_a_cell_to_each_side(cfg, frames, block):
+    """Claim: a push is valid if any cell holds a block, of its own, those up to its length ahead
+    and those a cell to either side: NumPy's windows of scattered cells agree."""
+    scattered = np.random.default_rng(0).random(block.height.shape) > 0.995
+    sparse = block.replace(height=jnp.where(scattered, 0.05, 0.0))
+    under = np.asarray(maps.cell_heights(frames, sparse.height)) > BARE
+    reach = int(np.ceil(cfg.sim.push_length / frames.cell))
+    padded = np.pad(under, ((0, 0), (1, 1), (0, reach)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (3, reach + 1), axis=(1, 2))
+    wanted = windows.any(axis=(3, 4)) & frames.inside & frames.reachable[PUSH]
+    assert_array_equal(np.asarray(maps.actionable_cells(frames, sparse))[PUSH], wanted)
+    assert 0.05 < wanted[frames.inside].mean() < 0.95
+
+
 def test_nothing_is_valid_outside_of_the_workspace(frames, block):
     """Claim: no action starts outside of the square, and on a bare table none is valid."""
     full = block.replace(height=jnp.full_like(block.height, 0.05))
