@@ -19,6 +19,7 @@ from flax import struct
 
 from csac_jax import presets
 from csac_jax.errors import DataWarning
+from csac_jax.evaluation import policies
 from csac_jax.io import checkpoint, files
 from csac_jax.io.checkpoint import CheckpointError
 
@@ -313,4 +314,16 @@ def test_config_of_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     folder = checkpoint.save(tmp_path, 4, _state(4), CFG, {})
     assert json.loads((folder / checkpoint.MANIFEST).read_text())
     with pytest.raises(CheckpointError, match=r"another version.*sweep: unknown setting"):
+        checkpoint.load_config(tmp_path)
+
+
+def test_a_run_acts_whatever_its_replay_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Claim: of a run with another value of a former setting of the replay the policy's config
+    loads; to resume it is refused by the setting's name."""
+    stored = checkpoint.configs.to_dict(CFG)
+    stored["replay"] |= {"rank_by": "reward"}
+    monkeypatch.setattr(checkpoint.configs, "to_dict", lambda _: stored)
+    checkpoint.save(tmp_path, 4, _state(4), CFG, {})
+    assert policies.load_config(tmp_path) == CFG
+    with pytest.raises(CheckpointError, match=r"replay\.rank_by: must be 'error'"):
         checkpoint.load_config(tmp_path)
